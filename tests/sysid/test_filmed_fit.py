@@ -104,6 +104,18 @@ def swing() -> FilmedProblem:
     return own.shortened(0.4)
 
 
+def test_starts_that_are_moved_along_the_rope_do_not_make_it_longer(swing: FilmedProblem) -> None:
+    (trial,) = swing.trials
+    # As if a gripper held its first end alone.
+    own = replace(swing, trials=(replace(trial, gripped=np.arange(len(trial.gripped)) < 2),))
+    modes = np.zeros((1, 1, 2, own.shapes.shape[1], 3))
+    modes[..., 0, 0, :] = 3 * (own.start.pos[0, -1] - own.start.pos[0, 0])
+    moved = own.begin(modes.reshape(1, 1, -1)).pos[0]
+    lengths = np.linalg.norm(np.diff(moved, axis=0), axis=1)
+    np.testing.assert_allclose(lengths[1:], np.diff(trial.marker_arclength)[1:], rtol=1e-12)
+    assert np.abs(moved - own.start.pos[0]).max() > 0.02
+
+
 def test_near_the_films_derivatives_are_those_of_small_steps(swing: FilmedProblem) -> None:
     numbers = np.concatenate([[3e-3, 2e-3, 0.5], np.zeros(len(swing.spines.nuisances.names))])
     raw, own = swing.space.to_raw(numbers), replace(swing)

@@ -48,6 +48,17 @@ def late():
     return pos, (0, 1, COUNT - 2, COUNT - 1)
 
 
+@pytest.mark.parametrize("size", [0.6, 0.7])
+def test_free_ends_are_not_folded(size):
+    """Of a rope that was measured too short by far, the nearest positions of the right length turn its end around."""
+    pos, held = arch(size, turn=0.3), (0, 1)
+    pos[:, 1] = pos[:, 0] + EDGE * (pos[:, 1] - pos[:, 0]) / (pos[:, 1] - pos[:, 0]).norm(dim=-1, keepdim=True)
+    found = agreeing_state(*started(pos, held)).rods.pos
+    torch.testing.assert_close(ratios(found), torch.ones(2, COUNT - 1, dtype=F64), rtol=0, atol=1e-6)
+    edges, measured = (x[:, 1:] - x[:, :-1] for x in (found, arch(turn=0.3)))
+    assert float(((edges * measured).sum(-1) / EDGE**2).min()) > 0.99
+
+
 @pytest.mark.parametrize("case", [stretched, late])
 def test_edges_get_their_lengths_and_what_is_held_stays(case):
     pos, held = case()

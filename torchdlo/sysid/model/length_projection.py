@@ -1,8 +1,9 @@
 """Starts that keep a rope's length: what is interpolated between markers is a little too long or too short.
 
 Where it is so by far, as of a rope that stretches, of markers that lag behind the grippers, or of a marker taken for
-another one, Newton's method for the nearest positions leads astray. It starts then from edges of the right length in
-the measured directions, laid one behind the other from what is held.
+another one, Newton's method for the nearest positions leads astray: it does not come to an end, or it folds a free end
+back. It starts then from edges of the right length in the measured directions, laid one behind the other from what is
+held.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ from torchdlo.physics.linalg.numerics import normalize, safe_norm
 _MISSED = 1e-3
 """Share of its length by which an edge may miss it where Newton's method is trusted."""
 
+_TURNED = 0.5
+"""Cosine of the angle by which an edge may turn there."""
+
 
 def agreeing_state(scene: scenes.Scene, params: scenes.Params, state: scenes.State) -> scenes.State:
     """Return the state with positions and velocities that keep the rope's length.
@@ -37,12 +41,16 @@ def agreeing_state(scene: scenes.Scene, params: scenes.Params, state: scenes.Sta
     active = rest.edge_mask * (1 - (1 - free) * (1 - torch.roll(free, -1, -2)))
     lengths = edge_lengths.Lengths(scene.topology, rest.length, torch.zeros_like(rest.length), active, rest.edge_mask)
 
+    measured = normalize(torch.roll(rods.pos, -1, -2) - rods.pos)
+
     def settled(pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         mobility = free / params.rods.material.mass
         pos, vel = edge_lengths.settle(lengths, pos, rods.vel, mobility, recorded=True)
         edge = torch.roll(pos, -1, -2) - pos
         missed = ((safe_norm(edge) / rest.length - 1).abs() * active).amax(-2, keepdim=True)
-        return pos, vel, missed.nan_to_num(torch.inf)
+        turned = ((normalize(edge) * measured).sum(-1, keepdim=True) < _TURNED) & (active > 0)
+        astray = turned.any(-2, keepdim=True) | missed.isnan()
+        return pos, vel, torch.where(astray, torch.inf, missed)
 
     pos, vel, missed = settled(rods.pos)
     diverged = missed > _MISSED

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import torch
 
 from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.diagnosis.error_floor import Refinement, refinement
@@ -15,6 +16,7 @@ from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import KNEE, ParameterSpace
 from torchdlo.sysid.estimation.observation import INDEPENDENT, SURE, FilmView, Spines
 from torchdlo.sysid.model import equilibrium
+from torchdlo.sysid.model.length_projection import lay_rope
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start, TrialBatch
 from torchdlo.sysid.recordings.recording import Recording, Trial
@@ -191,16 +193,28 @@ class FilmedProblem:
         return self.model.simulate(self.motion, self.begin(offsets), full, frames=frames)
 
     def begin(self, offsets: np.ndarray) -> Start:
-        """Return starts for P B simulations with offsets (P, B, J)."""
+        """Return starts for P B simulations with offsets (P, B, J); moved ropes are as long as they are."""
         mode = offsets.reshape(*offsets.shape[:2], 2, -1, 3)
         parts = (
             x[None] + size * np.einsum("mj,pbjc->pbmc", self.shapes, mode[:, :, k])
             for k, (x, size) in enumerate(((self.start.pos, _SHIFT), (self.start.vel, _DRIFT)))
         )
         pos, vel = (p.reshape(-1, *self.start.pos.shape[1:]) for p in parts)
+        moving = np.tile(~self.start.at_rest, len(offsets))
+        pos[moving] = self._laid(pos[moving])
         known = self.start.discretisation_correction
         more = None if known is None else np.tile(known, (len(offsets), 1, 1, 1))
         return Start(pos, vel, np.tile(self.start.at_rest, len(offsets)), more)
+
+    def _laid(self, pos: np.ndarray) -> np.ndarray:
+        """Return places (N, M, 3) of ropes that are as long as they are, in the directions of given ones.
+
+        Offsets along the rope would make it longer, and nearest positions of the right length have a folded end.
+        """
+        trial = self.trials[0]
+        length = torch.as_tensor(np.append(np.diff(trial.marker_arclength), 1.0)[:, None])
+        held = np.flatnonzero(trial.gripped).tolist()
+        return lay_rope(torch.as_tensor(pos), length, held, self.model.recording.closed).numpy()
 
     def frames(self, seconds: float | None) -> int | None:
         """Return how many frames have to be simulated for readings of the first seconds."""
