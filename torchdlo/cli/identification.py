@@ -79,6 +79,7 @@ def calibrate(
     from torchdlo.sysid.recordings.unit_doubts import doubts
 
     loaded = load_recording(recording)
+    _spare_cores(loaded)
     for doubt in doubts(loaded):
         typer.echo(f"check {doubt}", err=True)
     if out is None:
@@ -157,6 +158,7 @@ def diagnose(
     from torchdlo.sysid.recordings.unit_doubts import doubts
 
     loaded = load_recording(recording)
+    _spare_cores(loaded)
     for doubt in doubts(loaded):
         typer.echo(f"check {doubt}", err=True)
     out = out or Path("runs") / "diagnose" / recording.resolve().name
@@ -337,6 +339,14 @@ def _place_cameras(recording: Recording, model: Path, out: Path, camera: str, as
     typer.echo(f"cameras: {out / 'cameras.json'}\nreport:  {out / 'report.html'}", err=as_json)
     if as_json:
         typer.echo(camera_placement.camera_json(design), nl=False)
+
+
+def _spare_cores(recording: Recording) -> None:
+    """Fit to films in one thread: a second one makes that no faster, and costs half as much again."""
+    import torch
+
+    if recording.filmed:
+        torch.set_num_threads(1)
 
 
 def _run_calibration(recording: Recording, **options: Any) -> Calibration:
