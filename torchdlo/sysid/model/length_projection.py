@@ -22,9 +22,6 @@ from torchdlo.physics.linalg.numerics import normalize, safe_norm
 _MISSED = 1e-3
 """Share of its length by which an edge may miss it where Newton's method is trusted."""
 
-_TURNED = 0.5
-"""Cosine of the angle by which an edge may turn there."""
-
 
 def agreeing_state(scene: scenes.Scene, params: scenes.Params, state: scenes.State) -> scenes.State:
     """Return the state with positions and velocities that keep the rope's length.
@@ -41,15 +38,15 @@ def agreeing_state(scene: scenes.Scene, params: scenes.Params, state: scenes.Sta
     active = rest.edge_mask * (1 - (1 - free) * (1 - torch.roll(free, -1, -2)))
     lengths = edge_lengths.Lengths(scene.topology, rest.length, torch.zeros_like(rest.length), active, rest.edge_mask)
 
-    measured = normalize(torch.roll(rods.pos, -1, -2) - rods.pos)
+    measured = torch.roll(rods.pos, -1, -2) - rods.pos
 
     def settled(pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         mobility = free / params.rods.material.mass
         pos, vel = edge_lengths.settle(lengths, pos, rods.vel, mobility, recorded=True)
         edge = torch.roll(pos, -1, -2) - pos
         missed = ((safe_norm(edge) / rest.length - 1).abs() * active).amax(-2, keepdim=True)
-        turned = ((normalize(edge) * measured).sum(-1, keepdim=True) < _TURNED) & (active > 0)
-        astray = turned.any(-2, keepdim=True) | missed.isnan()
+        folded = ((edge * measured).sum(-1, keepdim=True) < 0) & (active > 0)
+        astray = folded.any(-2, keepdim=True) | missed.isnan()
         return pos, vel, torch.where(astray, torch.inf, missed)
 
     pos, vel, missed = settled(rods.pos)
