@@ -17,7 +17,7 @@ from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import load_recording
 from torchdlo.sysid.video import filmed, filmed_starts
 from torchdlo.sysid.video.filmed import begun_elsewhere, doubts
-from torchdlo.sysid.video.filmed_fit import eliminated, fit, look, normal, spread, time_films
+from torchdlo.sysid.video.filmed_fit import eliminated, fit, leave_astray, look, normal, spread, time_films
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, begin_from_balance, filmed_problem
 from torchdlo.sysid.video.filmed_starts import fit_starts, search_starts
 from torchdlo.sysid.video.films import with_stations
@@ -114,6 +114,26 @@ def test_starts_that_are_moved_along_the_rope_do_not_make_it_longer(swing: Filme
     lengths = np.linalg.norm(np.diff(moved, axis=0), axis=1)
     np.testing.assert_allclose(lengths[1:], np.diff(trial.marker_arclength)[1:], rtol=1e-12)
     assert np.abs(moved - own.start.pos[0]).max() > 0.02
+
+
+def test_trials_that_no_fit_follows_count_up_to_there(swing: FilmedProblem) -> None:
+    own = swing.picked(np.zeros(3, int))
+    own.trials = tuple(replace(t, name=f"train_{k}") for k, t in enumerate(own.trials))
+    raw = own.space.to_raw(np.concatenate([[3e-3, 2e-3, 0.5], np.zeros(len(own.spines.nuisances.names))]))
+    fit_starts(own, raw, 4)
+    found, good = look(own, raw, own.offset), own.spines.views[0].good.copy()
+    assert not leave_astray(own, found) and not own.astray
+    rest = slice(good.shape[1] - 3, None)
+    found.residual[1, rest] += 0.1
+    assert leave_astray(own, found)
+    (lost,), now = own.astray, own.spines.views[0].good
+    assert (
+        lost.name == "train_1" and lost.time == own.spines.views[0].time[1, rest.start] and "part at once" in lost.why
+    )
+    good[1, rest] = False
+    assert np.array_equal(now, good)
+    assert np.isnan(own.spines.target[1, rest, : own.spines.priors.start]).all()
+    assert np.isfinite(look(own, raw, own.offset, worth=lambda costs: False).costs).all()
 
 
 def test_near_the_films_derivatives_are_those_of_small_steps(swing: FilmedProblem) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -66,7 +67,19 @@ def errors_by_frame(sims: np.ndarray, trials: Sequence[Trial], frame_weights: np
     return found
 
 
-def misleading_trials(errors: np.ndarray, trials: Sequence[Trial], level: float) -> list[MisleadingTrial]:
+class Timed(Protocol):
+    """A trial, or a film of one."""
+
+    @property
+    def name(self) -> str:
+        """Name of the trial."""
+
+    @property
+    def time(self) -> np.ndarray:
+        """Times of the frames [s], shape (F,)."""
+
+
+def misleading_trials(errors: np.ndarray, trials: Sequence[Timed], level: float) -> list[MisleadingTrial]:
     """Return the trials that none of several models follows though models follow the others.
 
     Args:
@@ -103,7 +116,7 @@ def _parts(off: np.ndarray) -> int | None:
     return int(at[0]) if len(at) else None
 
 
-def _why(errors: np.ndarray, trial: Trial, frame: int, bar: float) -> str:
+def _why(errors: np.ndarray, trial: Timed, frame: int, bar: float) -> str:
     """Return what seems to be wrong with a trial that models do not follow from a frame on."""
     if trial.time[frame] < _EARLY:
         return "simulations are off from the beginning: its start is measured badly, or differs from the others'"

@@ -11,10 +11,12 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import torch
 
+from torchdlo.sysid.diagnosis.misleading_trials import misleading_trials
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import Point
 from torchdlo.sysid.estimation.model_uncertainty import CLAMP_SPREAD, radius_of_clamps, shear_share
@@ -32,7 +34,19 @@ from torchdlo.sysid.video import fit_memory
 from torchdlo.sysid.video.filmed_problem import STRETCHES, FilmedProblem
 from torchdlo.vision.spine import curve_vectors
 
-__all__ = ["Fit", "film_gaps", "fit", "gate", "intervals", "look", "picture_errors", "spread", "time_films", "total"]
+__all__ = [
+    "Fit",
+    "film_gaps",
+    "fit",
+    "gate",
+    "intervals",
+    "leave_astray",
+    "look",
+    "picture_errors",
+    "spread",
+    "time_films",
+    "total",
+]
 
 _BLOCK = 0.5
 """Time over which what simulations get wrong is one and the same error [s]."""
@@ -42,6 +56,9 @@ _GATE = 3.0
 
 _NEAR = 4e-3
 """Distance that is never taken for that of a wrong picture [m]."""
+
+_USUAL = 1e-3
+"""Error of trials that fits follow, at the least [m]."""
 
 _LOST = 1.0
 """What a trial costs whose simulation fails [m]."""
@@ -310,6 +327,27 @@ def gate(own: FilmedProblem, values: np.ndarray) -> int:
     if lost:
         own.spines = Spines(own.spines.views, own.model.dt, own.extent, own.spines.free, own.spines.sure)
     return lost
+
+
+def leave_astray(own: FilmedProblem, found: Fit) -> bool:
+    """Take out the rest of trials from where a fit does not follow them though it follows others; return if any was.
+
+    A rope that snaps over to the other side than the simulated one tells nothing of its numbers from there on.
+    """
+    last, starts = own.spines.priors.start, own.spines.times[..., 0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # pictures that are not good
+        errors = np.sqrt(np.nanmean(found.residual[..., :last] ** 2, 2))
+    films = [SimpleNamespace(name=t.name, time=time) for t, time in zip(own.trials, starts, strict=True)]
+    lost = misleading_trials(errors[None], films, _USUAL)
+    for each in lost:
+        b = [t.name for t in own.trials].index(each.name)
+        for view in own.spines.views:
+            view.good[b, view.time[b] >= each.time] = False
+    if lost:
+        own.astray = (*own.astray, *lost)
+        own.spines = Spines(own.spines.views, own.model.dt, own.extent, own.spines.free, own.spines.sure)
+    return bool(lost)
 
 
 def time_films(own: FilmedProblem, values: np.ndarray) -> None:

@@ -11,6 +11,7 @@ import torch
 
 from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.diagnosis.error_floor import Refinement, refinement
+from torchdlo.sysid.diagnosis.misleading_trials import MisleadingTrial
 from torchdlo.sysid.diagnosis.workspace import CHAIN
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import KNEE, ParameterSpace
@@ -61,6 +62,8 @@ class FilmedProblem:
     """Wrong frames by trial and camera."""
     options: dict[str, Any] = field(default_factory=dict)
     """Of the model."""
+    astray: tuple[MisleadingTrial, ...] = ()
+    """Trials that count up to a time only, as no fit follows them further."""
     discretisation_correction: Refinement | None = None
     """What finer simulations change, if it is known."""
     offset: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
