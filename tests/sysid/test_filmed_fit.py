@@ -17,7 +17,7 @@ from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import load_recording
 from torchdlo.sysid.video import filmed, filmed_starts
 from torchdlo.sysid.video.filmed import begun_elsewhere, doubts
-from torchdlo.sysid.video.filmed_fit import eliminated, fit, leave_astray, look, normal, spread, time_films
+from torchdlo.sysid.video.filmed_fit import discount_misleading, eliminated, fit, look, normal, spread, time_films
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, begin_from_balance, filmed_problem
 from torchdlo.sysid.video.filmed_starts import fit_starts, search_starts
 from torchdlo.sysid.video.films import with_stations
@@ -122,11 +122,11 @@ def test_trials_that_no_fit_follows_count_up_to_there(swing: FilmedProblem) -> N
     raw = own.space.to_raw(np.concatenate([[3e-3, 2e-3, 0.5], np.zeros(len(own.spines.nuisances.names))]))
     fit_starts(own, raw, 4)
     found, good = look(own, raw, own.offset), own.spines.views[0].good.copy()
-    assert not leave_astray(own, found) and not own.astray
+    assert not discount_misleading(own, found) and not own.misleading
     rest = slice(good.shape[1] - 3, None)
     found.residual[1, rest] += 0.1
-    assert leave_astray(own, found)
-    (lost,), now = own.astray, own.spines.views[0].good
+    assert discount_misleading(own, found)
+    (lost,), now = own.misleading, own.spines.views[0].good
     assert (
         lost.name == "train_1" and lost.time == own.spines.views[0].time[1, rest.start] and "part at once" in lost.why
     )

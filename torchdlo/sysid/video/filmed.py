@@ -35,11 +35,11 @@ from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.video import fit_memory
 from torchdlo.sysid.video.filmed_fit import (
     Fit,
+    discount_misleading,
     film_gaps,
     fit,
     gate,
     intervals,
-    leave_astray,
     look,
     picture_errors,
     time_films,
@@ -147,7 +147,7 @@ def _calibrated(
     low, high = intervals(own, best)
     for where, frames in own.dropped.items():
         notes.append(f"{where}: frames {', '.join(map(str, sorted(frames)))} stay far from the rope: left out.")
-    notes += [f"{trial.name} counts up to {trial.time:.2f} s only: {trial.why}." for trial in own.astray]
+    notes += [f"{trial.name} counts up to {trial.time:.2f} s only: {trial.why}." for trial in own.misleading]
     report("judging", 0, 1, "")
     found = [_judged(recording, split, own, first, values, notes, report) for split in ("train", "test")]
     report("judging", 1, 1, "")
@@ -261,7 +261,7 @@ def test_problem(
         unfitted_clocks(views, own.spines.views), own.model.dt, own.extent, own.spines.free, own.spines.sure
     )
     parts: dict[str, Any] = {"trials": tuple(trials), "motion": own.model.motion(trials), "spines": spines}
-    here = replace(own, **parts, dropped={}, astray=(), discretisation_correction=None)
+    here = replace(own, **parts, dropped={}, misleading=(), discretisation_correction=None)
     begin_from_balance(here, own.full(values[None])[0])
     if here.offset.shape[1]:
         coarse = here.with_options(substep=MAX_SUBSTEP)
@@ -322,7 +322,7 @@ def _fitted(own: FilmedProblem, raw: np.ndarray, iterations: int, report: Callba
     if np.isfinite(best.cost) and film_gaps(own, best).max() > near:
         return best
     best = restart(own, fit(own, best.raw, iterations), iterations)
-    if leave_astray(own, best):
+    if discount_misleading(own, best):
         best = fit(own, best.raw, iterations)
     report(stage, 2, 3, f"{1e3 * best.cost:.2f} mm")
     if not np.isfinite(best.cost):

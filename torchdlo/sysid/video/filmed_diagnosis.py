@@ -511,7 +511,7 @@ def _concluded(
         notes=[*notes, *([_far(level, floor)] if _blunt(level, floor) else [])],
         options={"budget": budget, "seed": seed, "vertices": final.own.options["vertices"]},
     )
-    done.overlays, done.misleading = shown, list(final.own.astray)
+    done.overlays, done.misleading = shown, list(final.own.misleading)
     return done
 
 

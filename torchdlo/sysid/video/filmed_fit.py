@@ -36,11 +36,11 @@ from torchdlo.vision.spine import curve_vectors
 
 __all__ = [
     "Fit",
+    "discount_misleading",
     "film_gaps",
     "fit",
     "gate",
     "intervals",
-    "leave_astray",
     "look",
     "picture_errors",
     "spread",
@@ -329,7 +329,7 @@ def gate(own: FilmedProblem, values: np.ndarray) -> int:
     return lost
 
 
-def leave_astray(own: FilmedProblem, found: Fit) -> bool:
+def discount_misleading(own: FilmedProblem, found: Fit) -> bool:
     """Take out the rest of trials from where a fit does not follow them though it follows others; return if any was.
 
     A rope that snaps over to the other side than the simulated one tells nothing of its numbers from there on.
@@ -345,7 +345,7 @@ def leave_astray(own: FilmedProblem, found: Fit) -> bool:
         for view in own.spines.views:
             view.good[b, view.time[b] >= each.time] = False
     if lost:
-        own.astray = (*own.astray, *lost)
+        own.misleading = (*own.misleading, *lost)
         own.spines = Spines(own.spines.views, own.model.dt, own.extent, own.spines.free, own.spines.sure)
     return bool(lost)
 

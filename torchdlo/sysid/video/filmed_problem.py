@@ -62,7 +62,7 @@ class FilmedProblem:
     """Wrong frames by trial and camera."""
     options: dict[str, Any] = field(default_factory=dict)
     """Of the model."""
-    astray: tuple[MisleadingTrial, ...] = ()
+    misleading: tuple[MisleadingTrial, ...] = ()
     """Trials that count up to a time only, as no fit follows them further."""
     discretisation_correction: Refinement | None = None
     """What finer simulations change, if it is known."""
