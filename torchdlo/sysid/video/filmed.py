@@ -321,15 +321,19 @@ def _fitted(own: FilmedProblem, raw: np.ndarray, iterations: int, report: Callba
     report(stage, 1, 3, f"{1e3 * best.cost:.2f} mm")
     if np.isfinite(best.cost) and film_gaps(own, best).max() > near:
         return best
-    best = restart(own, fit(own, best.raw, iterations), iterations)
-    if discount_misleading(own, best):
-        best = fit(own, best.raw, iterations)
+    best = _discounted(own, restart(own, fit(own, best.raw, iterations), iterations), iterations)
     report(stage, 2, 3, f"{1e3 * best.cost:.2f} mm")
     if not np.isfinite(best.cost):
         return best
-    best = clocked(own, sharper(own, best.raw, iterations), iterations)
+    # A rope may snap over to another side with other steps.
+    best = clocked(own, _discounted(own, sharper(own, best.raw, iterations), iterations), iterations)
     report(stage, 3, 3, f"{1e3 * best.cost:.2f} mm")
     return best
+
+
+def _discounted(own: FilmedProblem, best: Fit, iterations: int) -> Fit:
+    """Return the fit without the rest of trials that it does not follow."""
+    return fit(own, best.raw, iterations) if discount_misleading(own, best) else best
 
 
 def clocked(own: FilmedProblem, best: Fit, iterations: int) -> Fit:
