@@ -2,11 +2,12 @@
 
     python experiments/filmed_effects.py make --out runs/filmed_effects        # films of ropes that hide an effect
     python experiments/filmed_effects.py diagnose --out runs/filmed_effects    # and what is found in them, as a table
+    python experiments/filmed_effects.py table --json experiments/filmed_effects.json    # of what was stored
 
 `make` simulates ropes by the rod code of `experiments/hidden_effects`, which shares nothing with the program, and films
 them by one or two cameras that are written down wrongly, with noise, blur and 2 % wrong frames: each of five effects
 at ten times the noise of markers, and ropes that hide nothing. `diagnose` takes any folder of films with the answers
-beside it. What is there already is not done again.
+beside it. What is there already, in --out or in --json, is not done again.
 """
 
 from __future__ import annotations
@@ -94,6 +95,11 @@ def look_at(folder: Path, answers: Path, seed: int, page: Path) -> dict[str, Any
     }
 
 
+def kept(row: dict[str, Any]) -> dict[str, Any]:
+    """Return what is stored of a row in the repository."""
+    return {key: value for key, value in row.items() if key != "candidates"}
+
+
 def table(rows: list[dict[str, Any]]) -> str:
     """Return rows as Markdown, and how often findings are right, with 90 % bounds by counting (Clopper-Pearson)."""
     from scipy.stats import binomtest
@@ -121,7 +127,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 def main() -> None:
     """Make films, or diagnose those that are there."""
     parser = Parser(__file__, description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("what", choices=("make", "diagnose"))
+    parser.add_argument("what", choices=("make", "diagnose", "table"))
     parser.add_argument("--out", type=Path, default=Path("runs/filmed_effects"), help="folder that keeps what is done")
     parser.add_argument("--films", type=Path, default=None, help="folder of films, if not those that were made")
     parser.add_argument("--answers", type=Path, default=None, help="folder of what they hide, NAME.json with `answer`")
@@ -132,19 +138,24 @@ def main() -> None:
     parser.add_argument("--trials", type=count, default=2, help="most trials of each split")
     parser.add_argument("--seconds", type=float, default=2.5, help="of each trial")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", default="", help="file that keeps what was found")
     given = parser.parse_args()
     if given.what == "make":
         make(given.out, cases(given.seeds, given.nothing), given.cameras, given.trials, given.seconds)
         return
-    films, answers, rows = given.films or given.out / "films", given.answers or given.out / "answers", []
+    films, answers = given.films or given.out / "films", given.answers or given.out / "answers"
+    stored = Path(given.json) if given.json else None
+    rows = {r["name"]: r for r in json.loads(stored.read_text())["rows"]} if stored and stored.is_file() else {}
     names = given.only or sorted(p.name for p in films.iterdir() if (p / "rope.json").is_file())
-    for name in names:
+    for name in names if given.what == "diagnose" else ():
         done = given.out / "found" / f"{name}.json"
-        if not done.is_file():
+        if name not in rows and not done.is_file():
             save(str(done), look_at(films / name, answers, given.seed, given.out / "reports" / name))
-        rows.append(json.loads(done.read_text()))
-        print(table(rows[-1:]).splitlines()[2], flush=True)
-    print(table(rows))
+        if done.is_file():
+            rows[name] = json.loads(done.read_text())
+        print(table([rows[name]]).splitlines()[2], flush=True)
+        save(given.json, {"rows": [kept(rows[n]) for n in sorted(rows)]})
+    print(table([rows[n] for n in sorted(rows)]))
 
 
 if __name__ == "__main__":
