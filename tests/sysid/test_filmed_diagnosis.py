@@ -69,3 +69,10 @@ def test_fits_leave_models_and_starts_as_they_are(monkeypatch: pytest.MonkeyPatc
     assert own.offset.size == test.offset.size == 0 and model.own is own and model.test is test
     alone = filmed_diagnosis._fitted_on(FilmedModel(own, model.fit, own), 3, None)
     assert alone.test is alone.own
+
+
+def test_laws_that_say_as_much_of_unseen_films_are_not_told_apart() -> None:
+    best = {"friction": (0.09e-3, 0.34)}
+    assert filmed_diagnosis._alike(best | {"damping": (0.15e-3, 0.40)}, 0.01e-3) == ["friction", "damping"]
+    assert filmed_diagnosis._alike(best | {"damping": (0.15e-3, 0.20)}, 0.01e-3) == ["friction"]
+    assert filmed_diagnosis._alike({"damping": (0.095e-3, 0.20)} | best, 0.01e-3) == ["damping", "friction"]

@@ -271,7 +271,7 @@ def _round(
             min(0.05 * (rival.fit.cost - cost), 0.5 * max(levenberg_marquardt.cost_of(level), cost)),
             1e-12,
         )
-        close = [n for n in fair if fits[n].fit.cost - cost < tie]
+        close = _alike({n: (fits[n].fit.cost, _gain(rival, fits[n], "test", floor)) for n in fair}, tie)
         chosen = min(close, key=lambda n: len(fits[n].own.free))
         reasons |= dict.fromkeys(close, "as good as the best") | {chosen: "taken"}
         best, rivals = fits[chosen], [n for n in close if n != chosen]
@@ -286,6 +286,19 @@ def _round(
         for s in scores
     ]
     return best, candidates, rivals
+
+
+def _alike(found: Mapping[str, tuple[float, float]], tie: float) -> list[str]:
+    """Return which effects films do not tell from the one that fits best, itself among them.
+
+    A law with more numbers fits better; one that says as much of unseen films, or more, may be the true one as well.
+
+    Args:
+        found: costs on train films [m], and shares of the gap of unseen films that are closed, by effect.
+        tie: difference of costs that tells nothing [m].
+    """
+    cost, gain = min(found.values())
+    return [n for n, (c, g) in found.items() if c - cost < tie or g >= gain]
 
 
 def _gain(base: FilmedModel, other: FilmedModel, split: str, floor: ErrorFloor) -> float:
