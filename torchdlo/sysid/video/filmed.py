@@ -333,7 +333,8 @@ def _fitted(own: FilmedProblem, raw: np.ndarray, iterations: int, report: Callba
 
 def _discounted(own: FilmedProblem, best: Fit, iterations: int) -> Fit:
     """Return the fit without the rest of trials that it does not follow."""
-    return fit(own, best.raw, iterations) if discount_misleading(own, best) else best
+    simulated = bool(np.isfinite(best.costs).all())
+    return fit(own, best.raw, iterations) if simulated and discount_misleading(own, best) else best
 
 
 def clocked(own: FilmedProblem, best: Fit, iterations: int) -> Fit:
