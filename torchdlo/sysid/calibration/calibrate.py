@@ -21,7 +21,6 @@ from torchdlo.sysid.estimation.checkpoint import Checkpoint
 from torchdlo.sysid.estimation.jobs import FitJob
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.estimation.result import Calibration
-from torchdlo.sysid.estimation.result_cache import journal_of
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.model import initial_state as starts_of
 from torchdlo.sysid.model import model_file
@@ -31,6 +30,7 @@ from torchdlo.sysid.model.trial_batch import Start, TrialBatch
 from torchdlo.sysid.recordings.metrics import average, mean_absolute_error
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.recordings.wrench import check_forces, force_doubts
+from torchdlo.sysid.video import fit_memory
 from torchdlo.sysid.video.filmed import FILMED_STARTS, METHODS, calibrate_filmed
 
 Callback = Callable[[str, int, int, str], None]
@@ -138,8 +138,8 @@ def calibrate(
             raise InputError(f"{recording.path}: expected no --rest given for films.")
         options: dict[str, Any] = {"seed": seed, "vertices": vertices, "given": given, "method": method}
         options |= {"starts": min(starts, FILMED_STARTS), "iterations": iterations}
-        with journal_of(checkpoint, recording, options, resume=resume, command="calibrate") as results:
-            return calibrate_filmed(recording, **options, callback=callback, results=results)
+        with fit_memory.remembering(checkpoint, recording, options, resume=resume, command="calibrate"):
+            return calibrate_filmed(recording, **options, callback=callback)
     begun = time.perf_counter()
     check_forces(recording)
     if rest not in ("auto", "straight", "given"):

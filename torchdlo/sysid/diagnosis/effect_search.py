@@ -43,12 +43,13 @@ from torchdlo.sysid.diagnosis.verdict import (
 from torchdlo.sysid.diagnosis.workspace import CHAIN, SILENT, Callback, Workspace
 from torchdlo.sysid.estimation.jobs import FitJob, Fitted
 from torchdlo.sysid.estimation.levenberg_marquardt import interval
-from torchdlo.sysid.estimation.result_cache import ResultCache, journal_of
+from torchdlo.sysid.estimation.result_cache import ResultCache
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.recordings import data_quality
 from torchdlo.sysid.recordings.recording import Recording
 from torchdlo.sysid.recordings.wrench import check_forces, force_doubts
+from torchdlo.sysid.video import fit_memory
 from torchdlo.sysid.video.filmed_diagnosis import diagnose_filmed
 
 MUCH = 0.15
@@ -109,8 +110,8 @@ def diagnose(
             "without": tuple(without),
         }
         most = plan.pick_trials(recording, trials or BUDGETS[budget].trials)
-        with journal_of(journal, most, asked, resume=resume) as results:
-            return diagnose_filmed(most, **asked, workers=workers, callback=callback, results=results)
+        with fit_memory.remembering(journal, most, asked, resume=resume):
+            return diagnose_filmed(most, **asked, workers=workers, callback=callback)
     begun, report = time.perf_counter(), callback or (lambda *_: None)
     check_forces(recording)
     recording, faults = data_quality.check(recording)

@@ -6,7 +6,6 @@ that it comes to where it was stopped by reading instead of computing. Only plai
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import importlib
 import importlib.metadata
@@ -24,7 +23,7 @@ import numpy as np
 from torchdlo.journal import Journal, Records
 from torchdlo.sysid.recordings.recording import Recording
 
-__all__ = ["ResultCache", "Results", "decode", "digest", "encode", "journal_of", "program"]
+__all__ = ["ResultCache", "Results", "decode", "digest", "encode", "program"]
 
 _DAMAGED = (
     OSError,
@@ -147,19 +146,6 @@ class ResultCache:
         for k, result in compute([jobs[k] for k in missing]) if missing else ():
             self.results.keep(jobs[missing[k]], result)
             yield missing[k], result
-
-
-@contextlib.contextmanager
-def journal_of(path: Path | None, *about: Any, **how: Any) -> Iterator[Results | None]:
-    """Hold a journal while the block lasts, see `ResultCache`, and give its results; None where none is kept."""
-    if path is None:
-        yield None
-        return
-    cache = ResultCache(path, *about, **how)
-    try:
-        yield cache.results
-    finally:
-        cache.close()
 
 
 def _name(job: Any) -> str:

@@ -27,12 +27,10 @@ from torchdlo.sysid.estimation.observation import (
     unfitted_clocks,
 )
 from torchdlo.sysid.estimation.result import Calibration, Overlay
-from torchdlo.sysid.estimation.result_cache import Results
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.model.rope_model import MAX_SUBSTEP
 from torchdlo.sysid.recordings.recording import Recording, Trial
-from torchdlo.sysid.video import fit_memory
 from torchdlo.sysid.video.filmed_fit import (
     Fit,
     discount_misleading,
@@ -106,7 +104,6 @@ def calibrate_filmed(
     given: ModelFile | None = None,
     method: str = "auto",
     callback: Callback | None = None,
-    results: Results | None = None,
 ) -> Calibration:
     """Fit the baseline model to the films of the train trials and judge it on those of the test trials.
 
@@ -120,24 +117,9 @@ def calibrate_filmed(
         method: "gradient" to go on with the stiffness along the rope, by the gradient of masks; "differences" or "auto"
             to stay with few numbers, for which finite differences of centre lines are quicker.
         callback: told (stage, steps done, in all, message).
-        results: where to keep what fits come to, and to look for what an earlier run kept.
     """
-    asked = starts, iterations, seed, vertices, given, method
-    with fit_memory.remembering(results):
-        return _calibrated(recording, *asked, callback or (lambda *_: None))
-
-
-def _calibrated(
-    recording: Recording,
-    starts: int,
-    iterations: int,
-    seed: int,
-    vertices: int | None,
-    given: ModelFile | None,
-    method: str,
-    report: Callback,
-) -> Calibration:
     begun = time.perf_counter()
+    report = callback or (lambda *_: None)
     views, notes = views_of(recording, recording.train, report)
     own, first, best = baseline(recording, views, starts, iterations, seed, vertices, given, report)
     if method == "gradient":

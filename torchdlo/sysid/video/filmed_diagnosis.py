@@ -22,10 +22,8 @@ from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, verdict_word
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.jobs import Fitted
-from torchdlo.sysid.estimation.result_cache import Results
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.recordings.recording import Recording
-from torchdlo.sysid.video import fit_memory
 from torchdlo.sysid.video.filmed import FILMED_STARTS, baseline
 from torchdlo.sysid.video.filmed_beginnings import NEAR, chain_note, chained, further, left_out, nearer
 from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, fit, look, spread, total
@@ -101,23 +99,10 @@ def diagnose_filmed(
     without: Sequence[str] = (),
     workers: int | None = None,
     callback: Callback | None = None,
-    results: Results | None = None,
 ) -> Diagnosis:
-    """Name what the films of a recording show that the baseline model lacks; see `effect_search.diagnose`.
-
-    Args:
-        recording: with films.
-        budget: "fast" or "full".
-        seed: of the random starts.
-        vertices: of the simulated rope.
-        given: model to take as the baseline.
-        without: effects that are not looked for.
-        workers: processes.
-        callback: told (stage, steps done, in all, message).
-        results: where to keep what fits come to, and to look for what an earlier run kept.
-    """
+    """Name what the films of a recording show that the baseline model lacks; see `effect_search.diagnose`."""
     asked = budget, seed, vertices, given, without
-    with FitPool(workers, results) as pool, fit_memory.remembering(results):
+    with FitPool(workers) as pool:
         return _diagnosed(recording, *asked, pool, callback or (lambda *_: None))
 
 

@@ -1,26 +1,32 @@
 """What fits to films came to, written down: a diagnosis that was stopped reads there what it had done.
 
 A fit is kept as the numbers and starts that it found, by all that it depends on. What films leave over there is looked
-at once more, which costs a hundredth of the fit.
+at once more, which costs as much as one of its steps.
 """
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchdlo.sysid.estimation.result_cache import Results
+from torchdlo.sysid.estimation.result_cache import ResultCache, Results
 
 if TYPE_CHECKING:
     from torchdlo.sysid.video.filmed_problem import FilmedProblem
 
-__all__ = ["keep", "recall", "remember", "remembering", "task"]
+__all__ = ["keep", "place", "recall", "remember", "remembering", "task"]
 
 _results: Results | None = None
 """Where this process keeps them; nowhere if not set."""
+
+
+def place() -> Results | None:
+    """Return where the fits of this process are kept, None if they are not."""
+    return _results
 
 
 def remember(results: Results | None) -> None:
@@ -30,14 +36,18 @@ def remember(results: Results | None) -> None:
 
 
 @contextlib.contextmanager
-def remembering(results: Results | None) -> Iterator[None]:
-    """Keep fits as long as the block lasts."""
-    before = _results
-    remember(results)
+def remembering(path: Path | None, *about: Any, **how: Any) -> Iterator[None]:
+    """Keep fits in a journal as long as the block lasts, see `ResultCache`; nowhere if there is no path."""
+    if path is None:
+        yield
+        return
+    cache, before = ResultCache(path, *about, **how), place()
+    remember(cache.results)
     try:
         yield
     finally:
         remember(before)
+        cache.close()
 
 
 def task(own: FilmedProblem, *asked: Any) -> tuple[Any, ...] | None:

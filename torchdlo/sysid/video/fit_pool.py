@@ -20,14 +20,12 @@ __all__ = ["FitPool"]
 class FitPool:
     """Processes that are started when there is work for more than one."""
 
-    def __init__(self, workers: int | None = None, results: Results | None = None) -> None:
+    def __init__(self, workers: int | None = None) -> None:
         """Start nothing yet.
 
         Args:
             workers: how many; one per core if not given. One means this process.
-            results: where processes keep what fits come to.
         """
-        self._results = results
         self.workers = workers or max(1, os.cpu_count() or 1)
         self._processes: ProcessPoolExecutor | None = None
 
@@ -55,7 +53,7 @@ class FitPool:
             return
         if self._processes is None:
             context = multiprocessing.get_context("spawn")
-            self._processes = ProcessPoolExecutor(self.workers, context, _begin, (self._results,))
+            self._processes = ProcessPoolExecutor(self.workers, context, _begin, (fit_memory.place(),))
         try:
             waiting: dict[Future, int] = {self._processes.submit(what, *job): k for k, job in enumerate(jobs)}
             while waiting:
