@@ -136,6 +136,24 @@ def test_trials_that_no_fit_follows_count_up_to_there(swing: FilmedProblem) -> N
     assert np.isfinite(look(own, raw, own.offset, worth=lambda costs: False).costs).all()
 
 
+def test_trials_that_mislead_are_found_by_cameras_of_other_rates(swing: FilmedProblem) -> None:
+    own = swing.picked(np.zeros(3, int))
+    own.trials = tuple(replace(t, name=f"train_{k}") for k, t in enumerate(own.trials))
+    (quick,) = own.spines.views
+    parts = {name: getattr(quick, name)[:, ::2].copy() for name in ("good", "places", "tangents")}
+    slow = replace(quick, camera=replace(quick.camera, name="slow", fps=quick.camera.fps / 2), **parts)
+    own.spines = Spines([slow, quick], own.model.dt, own.extent, own.spines.free)
+    found = look(own, own.space.to_raw(np.r_[3e-3, 2e-3, 0.5, np.zeros(16)]), own.offset)
+    found.residual[:] = np.where(np.isfinite(found.residual), 1e-3, np.nan)
+    found.residual[1, own.spines.times[1] > 0.3] = 0.1
+    assert discount_misleading(own, found)
+    (lost,) = own.misleading
+    assert lost.name == "train_1" and 0.3 < lost.time < 0.34
+    for view in own.spines.views:
+        late = view.time[1] >= lost.time
+        assert not view.good[1, late].any() and view.good[1, ~late].any() and view.good[[0, 2]][:, late].any()
+
+
 def test_near_the_films_derivatives_are_those_of_small_steps(swing: FilmedProblem) -> None:
     numbers = np.concatenate([[3e-3, 2e-3, 0.5], np.zeros(len(swing.spines.nuisances.names))])
     raw, own = swing.space.to_raw(numbers), replace(swing)

@@ -342,7 +342,7 @@ def _place_cameras(recording: Recording, model: Path, out: Path, camera: str, as
 
 
 def _spare_cores(recording: Recording) -> None:
-    """Fit to films in one thread: a second one makes that no faster, and costs half as much again."""
+    """Fit to films in one thread: a second one makes that no faster, and costs two thirds as much again."""
     import torch
 
     if recording.filmed:

@@ -334,11 +334,17 @@ def discount_misleading(own: FilmedProblem, found: Fit) -> bool:
 
     A rope that snaps over to the other side than the simulated one tells nothing of its numbers from there on.
     """
-    last, starts = own.spines.priors.start, own.spines.times[..., 0]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # pictures that are not good
-        errors = np.sqrt(np.nanmean(found.residual[..., :last] ** 2, 2))
-    films = [SimpleNamespace(name=t.name, time=time) for t, time in zip(own.trials, starts, strict=True)]
+    last = own.spines.priors.start
+    # Cameras may have rates of their own: what they read goes to pictures of the quickest one.
+    grid = max((v.time for v in own.spines.views), key=lambda time: time.shape[1])
+    errors = np.full(grid.shape, np.nan)
+    for b, (left, when) in enumerate(zip(found.residual[..., :last], own.spines.times[..., :last], strict=True)):
+        seen = np.isfinite(left)
+        frame = np.minimum(np.searchsorted(grid[b], when[seen]), grid.shape[1] - 1)
+        count = np.bincount(frame, minlength=grid.shape[1])
+        square = np.bincount(frame, left[seen] ** 2, grid.shape[1])
+        errors[b, count > 0] = np.sqrt(square[count > 0] / count[count > 0])
+    films = [SimpleNamespace(name=t.name, time=time) for t, time in zip(own.trials, grid, strict=True)]
     lost = misleading_trials(errors[None], films, _USUAL)
     for each in lost:
         b = [t.name for t in own.trials].index(each.name)

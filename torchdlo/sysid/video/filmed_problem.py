@@ -217,7 +217,7 @@ class FilmedProblem:
         trial = self.trials[0]
         length = torch.as_tensor(np.append(np.diff(trial.marker_arclength), 1.0)[:, None])
         held = np.flatnonzero(trial.gripped).tolist()
-        return lay_rope(torch.as_tensor(pos), length, held, self.model.recording.closed).numpy()
+        return lay_rope(torch.as_tensor(pos), length, held, closed=False).numpy()  # as models are
 
     def frames(self, seconds: float | None) -> int | None:
         """Return how many frames have to be simulated for readings of the first seconds."""
