@@ -146,7 +146,7 @@ def main() -> None:
     films, answers = given.films or given.out / "films", given.answers or given.out / "answers"
     stored = Path(given.json) if given.json else None
     rows = {r["name"]: r for r in json.loads(stored.read_text())["rows"]} if stored and stored.is_file() else {}
-    names = given.only or sorted(p.name for p in films.iterdir() if (p / "rope.json").is_file())
+    names = given.only or sorted(file.parent.name for file in films.glob("*/rope.json"))
     for name in names if given.what == "diagnose" else ():
         done = given.out / "found" / f"{name}.json"
         if name not in rows and not done.is_file():
