@@ -46,6 +46,7 @@ from torchdlo.sysid.video.filmed_problem import (
     FilmedProblem,
     add_correction,
     begin_from_balance,
+    correct,
     filmed_problem,
     keep_steps_only,
 )
@@ -354,12 +355,31 @@ def sharper(own: FilmedProblem, raw: np.ndarray, iterations: int) -> Fit:
 
 
 def _corrected(own: FilmedProblem, raw: np.ndarray, iterations: int) -> Fit:
-    """Return the fit with what finer simulations change; without what their mesh changes if that fits worse."""
+    """Return the fit with what finer simulations change, asked again nearer to the minimum if that fits worse."""
     offset = own.offset
     if not offset.shape[1]:
         add_correction(own, own.space.to_values(raw))
         return fit(own, raw, iterations)
-    before = look(own, raw, offset, fixed=True).cost
+    before = look(own, raw, offset, worth=lambda costs: False).cost
+    best = _finer(own, raw, iterations, before)
+    if not best.cost > _WORSE * before:
+        return best
+    own.offset = offset
+    correct(own, None)
+    plain = fit(own, raw, iterations)
+    return _finer(own, plain.raw, iterations, plain.cost)
+
+
+def _finer(own: FilmedProblem, raw: np.ndarray, iterations: int, before: float) -> Fit:
+    """Return the fit with what finer simulations change; and not their mesh if that costs more than before.
+
+    Args:
+        own: the problem, of trials in motion.
+        raw: coordinates (N,) to start from.
+        iterations: most steps.
+        before: cost of the fit without corrections [m].
+    """
+    offset = own.offset
     add_correction(own, own.space.to_values(raw))
     best = fit(own, raw, min(iterations, _LAST), near=True)
     if best.cost > _WORSE * before:

@@ -61,7 +61,8 @@ def nearer(films: Films, best: Fit, report: Callback) -> FilmedModel:
             break
         raw = found.raw
     require_simulated(whole.model.recording, found)
-    found = sharper(own, found.raw, _FOLLOW)
+    # Finer simulations may need other starts.
+    found = restart(own, sharper(own, found.raw, _FOLLOW), _FOLLOW)
     return films.test(own, found)
 
 

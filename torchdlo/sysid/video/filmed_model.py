@@ -13,7 +13,7 @@ from torchdlo.sysid.recordings.recording import Trial
 from torchdlo.sysid.video.filmed import test_problem
 from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, time_films
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, first_frames
-from torchdlo.sysid.video.filmed_starts import fit_starts
+from torchdlo.sysid.video.filmed_starts import begin_anew, fit_starts
 
 __all__ = ["FilmedModel", "Films", "extended"]
 
@@ -42,7 +42,8 @@ class FilmedModel:
         if self._tested is None:
             here = self.test
             if here.offset.shape[1]:
-                fit_starts(here, self.fit.raw, 3)
+                costs = fit_starts(here, self.fit.raw, 3)
+                begin_anew(here, self.fit.raw, costs)
             time_films(here, self.values)
             read = here.spines.read(here.simulate(self.values[None]), self.values[None, len(here.free) :])[0]
             residual = np.where(np.isfinite(here.spines.target), read, np.nan)[:, :, : here.spines.priors.start, 0]

@@ -378,10 +378,10 @@ def add_correction(own: FilmedProblem, values: np.ndarray) -> None:
     correct(own, replace(found, links=length))
 
 
-def correct(own: FilmedProblem, found: Refinement) -> None:
+def correct(own: FilmedProblem, found: Refinement | None) -> None:
     """Add to simulations from now on what is known of finer ones."""
     own.discretisation_correction = found
-    own.start = replace(own.start, discretisation_correction=found.correction)
+    own.start = replace(own.start, discretisation_correction=None if found is None else found.correction)
 
 
 def keep_steps_only(own: FilmedProblem) -> None:

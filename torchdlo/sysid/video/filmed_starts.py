@@ -20,7 +20,16 @@ from torchdlo.sysid.video import fit_memory
 from torchdlo.sysid.video.filmed_fit import Fit, fit, look, total
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, begin_from_balance
 
-__all__ = ["START_WINDOW", "fit_starts", "refine_start", "restart", "scout", "search_starts", "start_window"]
+__all__ = [
+    "START_WINDOW",
+    "begin_anew",
+    "fit_starts",
+    "refine_start",
+    "restart",
+    "scout",
+    "search_starts",
+    "start_window",
+]
 
 Callback = Callable[[str, int, int, str], None]
 
@@ -138,20 +147,33 @@ def restart(own: FilmedProblem, found: Fit, iterations: int, enough: float = _LO
         iterations: most steps of each improvement.
         enough: cost [m] from which a trial may have a wrong start; less if it stands out.
     """
-    for _ in range(_RESTARTS if own.offset.shape[1] else 0):
-        lost = np.flatnonzero(~own.start.at_rest & ~(found.costs < min(enough, _standing_out(found.costs))))
-        if not len(lost):
+    for _ in range(_RESTARTS):
+        if not begin_anew(own, found.raw, found.costs, enough):
             break
-        part = own.picked(lost)
-        search_starts(part, found.raw, seconds=start_window(part))
-        costs = fit_starts(part, found.raw, 8)
-        better = costs < _PAYS * found.costs[lost]
-        if not better.any():
-            break
-        own.offset = own.offset.copy()
-        own.offset[lost[better]] = part.offset[better]
         found = fit(own, found.raw, iterations)
     return found
+
+
+def begin_anew(own: FilmedProblem, raw: np.ndarray, costs: np.ndarray, enough: float = _LOST) -> bool:
+    """Look for other starts of lost trials of the problem, which are set to those that are better; return if any is.
+
+    Args:
+        own: the problem.
+        raw: coordinates (N,), which stay as they are.
+        costs: of its trials [m], shape (B,).
+        enough: cost [m] from which a trial may have a wrong start; less if it stands out.
+    """
+    if not own.offset.shape[1]:
+        return False
+    lost = np.flatnonzero(~own.start.at_rest & ~(costs < min(enough, _standing_out(costs))))
+    if not len(lost):
+        return False
+    part = own.picked(lost)
+    search_starts(part, raw, seconds=start_window(part))
+    better = fit_starts(part, raw, 8) < _PAYS * costs[lost]
+    own.offset = own.offset.copy()
+    own.offset[lost[better]] = part.offset[better]
+    return bool(better.any())
 
 
 def _standing_out(costs: np.ndarray) -> float:
@@ -179,15 +201,17 @@ def search_starts(own: FilmedProblem, raw: np.ndarray, passes: int = 8, *, secon
 
 
 def _places(own: FilmedProblem) -> np.ndarray:
-    """Return starts (P, B, J): those of the problem, and others nearer and farther, coming and going."""
+    """Return starts (P, B, J): those of the problem, and ropes in balance nearer and farther, coming and going.
+
+    These have none of the shapes with which a rope that was begun wrongly made up for that.
+    """
     away = np.array(own.spines.views[0].camera.rotation)[2]
     out = [own.offset]
     for place in (-_NEARER, _NEARER):
         for speed in (-_FASTER, _FASTER):
-            each = own.offset.reshape(len(own.offset), 2, -1, 3).copy()
-            for k, size in enumerate((place, speed)):
-                # The first of the shapes is the whole rope's; the others follow.
-                each[:, k, 0] += (size - each[:, k, 0] @ away)[:, None] * away
+            each = np.zeros((len(own.offset), 2, own.offset.shape[1] // 6, 3))
+            # The first of the shapes is the whole rope's; the others follow.
+            each[:, :, 0] = np.array([[place], [speed]]) * away
             out.append(each.reshape(own.offset.shape))
     return np.stack(out)
 
