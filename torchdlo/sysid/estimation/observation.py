@@ -116,12 +116,12 @@ class FilmView:
         return replace(self, packed=packed, shown=shown, **own)
 
     def shortened(self, seconds: float) -> FilmView:
-        """Return what was seen in the first seconds; frames that turn out wrong are so in both."""
+        """Return what was seen in the first seconds."""
         inside = self.time <= seconds
         count = int(inside.sum(1).max())
         good, places, tangents = self.good[:, :count], self.places[:, :count], self.tangents[:, :count]
         if not inside[:, :count].all():
-            # Frames that turn out wrong later are so in both: what is too late has no centre line.
+            # Of cameras that began earlier than others what is too late has no centre line.
             places = np.where(inside[:, :count, None, None], places, np.nan)
         return replace(self, good=good, places=places, tangents=tangents)
 
@@ -381,7 +381,8 @@ class Spines(_Filmed):
         places = torch.as_tensor(view.places, dtype=sims.dtype).nan_to_num(1e6)[None]
         if pairs is None:
             away, along = curve_vectors(pixel, places)
-            edge = along.floor().long().clamp(max=pixel.shape[-2] - 2)
+            # A trial whose simulation failed has no places; the others go on.
+            edge = along.nan_to_num(0.0).floor().long().clamp(0, pixel.shape[-2] - 2)
         else:
             edge = pairs[0].expand(len(sims), *pairs[0].shape[1:])
             away = _to_edges(pixel, places, edge)

@@ -155,7 +155,8 @@ def _name(job: Any) -> str:
 def program() -> str:
     """Return a hash of the program itself: its version alone does not change with every edit of a law."""
     root, found = Path(__file__).parents[2], hashlib.sha256()
-    parts = [root / "scene.py", *(f for name in ("physics", "coupling", "sysid") for f in (root / name).rglob("*.py"))]
+    folders = ("physics", "coupling", "sysid", "vision")
+    parts = [root / "scene.py", *(f for name in folders for f in (root / name).rglob("*.py"))]
     kernels = [f for name in ("physics", "coupling") for end in ("cpp", "h") for f in (root / name).rglob(f"*.{end}")]
     for file in sorted([*parts, *kernels]):
         found.update(file.name.encode() + file.read_bytes())
