@@ -14,6 +14,7 @@ from torchdlo.report.pages import diagnosis as page
 from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
 from torchdlo.sysid.diagnosis.effect_library import library
 from torchdlo.sysid.diagnosis.effect_search import diagnose
+from torchdlo.sysid.diagnosis.error_floor import ErrorFloor
 from torchdlo.sysid.diagnosis.findings import findings_json, model_json, summary
 from torchdlo.sysid.recordings.recording import load_recording
 from torchdlo.sysid.video import filmed_diagnosis, filmed_fit
@@ -72,7 +73,44 @@ def test_fits_leave_models_and_starts_as_they_are(monkeypatch: pytest.MonkeyPatc
 
 
 def test_laws_that_say_as_much_of_unseen_films_are_not_told_apart() -> None:
-    best = {"friction": (0.09e-3, 0.34)}
-    assert filmed_diagnosis._alike(best | {"damping": (0.15e-3, 0.40)}, 0.01e-3) == ["friction", "damping"]
-    assert filmed_diagnosis._alike(best | {"damping": (0.15e-3, 0.20)}, 0.01e-3) == ["friction"]
-    assert filmed_diagnosis._alike({"damping": (0.095e-3, 0.20)} | best, 0.01e-3) == ["damping", "friction"]
+    best = {"friction": (0.09e-3, 0.9, 0.34)}
+    for damping, alike in (
+        ((0.15e-3, 0.8, 0.40), ["friction", "damping"]),
+        ((0.15e-3, 0.2, 0.40), ["friction"]),
+        ((0.15e-3, 0.8, 0.20), ["friction"]),
+        ((0.095e-3, 0.9, 0.20), ["friction", "damping"]),
+    ):
+        assert filmed_diagnosis._alike(best | {"damping": damping}, 0.01e-3) == alike
+
+
+def test_each_train_trial_has_to_be_as_near_as_simulations_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A trial that magnifies small errors does not hide what another one shows."""
+    steady, shaky = ErrorFloor(0.3e-3, 0.0, 0.3e-3), ErrorFloor(0.3e-3, 0.0, 2e-3)
+    monkeypatch.setattr(filmed_diagnosis, "_floors", lambda _: [steady, shaky])
+    both, _ = filmed_diagnosis._floor(None)  # type: ignore[arg-type]
+    assert both.noise == 0.3e-3 and abs(both.grid - np.sqrt((0.3e-3**2 + 2e-3**2) / 2)) < 1e-12
+    for train, test, beside, nothing in (
+        ((0.4e-3, 2e-3), 1e-3, False, True),
+        ((1e-3, 1e-3), 1e-3, False, False),
+        ((0.4e-3, 2e-3), 3e-3, False, False),
+        ((1e-3, 1e-3), 1e-3, True, True),
+    ):
+        model: Any = SimpleNamespace(gaps={"train": np.array(train), "test": np.array([test])}.__getitem__)
+        assert filmed_diagnosis._nothing_left(model, both, beside) is nothing
+
+
+def test_a_rival_takes_the_starts_of_trials_that_it_fits_better_with(monkeypatch: pytest.MonkeyPatch) -> None:
+    none: Any = None
+    own, other = (FilmedProblem(none, (), none, none, none, (), np.zeros(0), {}) for _ in range(2))
+    own.offset, other.offset = np.zeros((2, 6)), np.ones((2, 6))
+    rival = FilmedModel(own, SimpleNamespace(raw=np.zeros(1), costs=np.array([1e-3, 1e-3])), own)
+    effect = FilmedModel(other, none, other)
+    monkeypatch.setattr(filmed_diagnosis, "fit", lambda problem, *_: "fitted on")
+    for costs, taken in (([0.5e-3, 2e-3], [1, 0]), ([2e-3, 2e-3], None)):
+        monkeypatch.setattr(filmed_diagnosis, "fit_starts", lambda *_, costs=costs: np.array(costs))
+        found = filmed_diagnosis._begun_alike(rival, effect)
+        if taken is None:
+            assert found is rival
+        else:
+            assert found.fit == "fitted on" and found.own.offset[:, 0].tolist() == taken
+    assert not own.offset.any() and other.offset.all()

@@ -60,7 +60,7 @@ def test_lost_trials_begin_anew_and_failed_ones_are_told(monkeypatch: pytest.Mon
     ):
         monkeypatch.setattr(filmed, "fit", lambda *_, out=first, **__: out)
         monkeypatch.setattr(filmed, "restart", lambda *_, out=then: out)
-        monkeypatch.setattr(filmed, "discount_misleading", lambda *_: False)
+        monkeypatch.setattr(filmed, "misleading_films", lambda _: [])
         monkeypatch.setattr(filmed, "sharper", lambda own, *_: replace(fair, raw=np.ones(1)))
         found = filmed._fitted(own, none, 1, lambda *_: None, near)
         assert found.raw.size == 1 if wanted == "sharper" else found is wanted

@@ -33,12 +33,12 @@ from torchdlo.sysid.model.rope_model import MAX_SUBSTEP
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.video.filmed_fit import (
     Fit,
-    discount_misleading,
     film_gaps,
     fit,
     gate,
     intervals,
     look,
+    misleading_films,
     picture_errors,
     time_films,
 )
@@ -48,7 +48,7 @@ from torchdlo.sysid.video.filmed_problem import (
     begin_from_balance,
     correct,
     filmed_problem,
-    keep_steps_only,
+    without_rest,
 )
 from torchdlo.sysid.video.filmed_starts import START_WINDOW, fit_starts, refine_start, restart, scout, start_window
 from torchdlo.sysid.video.footage import views_of
@@ -61,6 +61,7 @@ __all__ = [
     "METHODS",
     "baseline",
     "calibrate_filmed",
+    "corrected",
     "doubts",
     "require_simulated",
     "sharper",
@@ -273,8 +274,9 @@ def _problem(
         return _at_rest(own) if recording.still else own
     options = dict(given.options) | ({} if vertices is None else {"vertices": vertices})
     model = given.model(recording, **({} if vertices is None else {"vertices": vertices}))
-    more: dict[str, Any] = {"effects": given.effects, "values": given.start(model), "fitted": tuple(given.sizes(model))}
-    own = filmed_problem(recording, recording.train, views, options=options, **more)
+    sizes = given.sizes(model)
+    more: dict[str, Any] = {"effects": given.effects, "values": given.start(model), "fitted": tuple(sizes)}
+    own = replace(filmed_problem(recording, recording.train, views, options=options, **more), sizes=sizes)
     return _at_rest(own) if recording.still else own
 
 
@@ -304,20 +306,26 @@ def _fitted(own: FilmedProblem, raw: np.ndarray, iterations: int, report: Callba
     report(stage, 1, 3, f"{1e3 * best.cost:.2f} mm")
     if np.isfinite(best.cost) and film_gaps(own, best).max() > near:
         return best
-    best = _discounted(own, restart(own, fit(own, best.raw, iterations), iterations), iterations)
+    best = restart(own, fit(own, best.raw, iterations), iterations)
+    # A diagnosis asks what effects say of a trial before it takes one for misleading.
+    judge = _discounted if not np.isfinite(near) else lambda _, found, __: found
+    best = judge(own, best, iterations)
     report(stage, 2, 3, f"{1e3 * best.cost:.2f} mm")
     if not np.isfinite(best.cost):
         return best
     # A rope may snap over to another side with other steps.
-    best = clocked(own, _discounted(own, sharper(own, best.raw, iterations), iterations), iterations)
+    best = clocked(own, judge(own, sharper(own, best.raw, iterations), iterations), iterations)
     report(stage, 3, 3, f"{1e3 * best.cost:.2f} mm")
     return best
 
 
 def _discounted(own: FilmedProblem, best: Fit, iterations: int) -> Fit:
     """Return the fit without the rest of trials that it does not follow."""
-    simulated = bool(np.isfinite(best.costs).all())
-    return fit(own, best.raw, iterations) if simulated and discount_misleading(own, best) else best
+    lost = misleading_films([(own, best)])
+    if not lost:
+        return best
+    own.take(without_rest(own, lost))
+    return fit(own, best.raw, iterations)
 
 
 def clocked(own: FilmedProblem, best: Fit, iterations: int) -> Fit:
@@ -351,10 +359,10 @@ def sharper(own: FilmedProblem, raw: np.ndarray, iterations: int) -> Fit:
     own.take(own.with_options(substep=own.model.dt / (2 * own.model.substeps)))
     best = fit(own, raw, min(iterations, _LAST), near=True)
     gate(own, own.space.to_values(best.raw))
-    return _corrected(own, best.raw, iterations)
+    return corrected(own, best.raw, iterations)
 
 
-def _corrected(own: FilmedProblem, raw: np.ndarray, iterations: int) -> Fit:
+def corrected(own: FilmedProblem, raw: np.ndarray, iterations: int) -> Fit:
     """Return the fit with what finer simulations change, asked again nearer to the minimum if that fits worse."""
     offset = own.offset
     if not offset.shape[1]:
@@ -379,12 +387,12 @@ def _finer(own: FilmedProblem, raw: np.ndarray, iterations: int, before: float) 
         iterations: most steps.
         before: cost of the fit without corrections [m].
     """
-    offset = own.offset
+    offset, own.steps_only = own.offset, False
     add_correction(own, own.space.to_values(raw))
     best = fit(own, raw, min(iterations, _LAST), near=True)
     if best.cost > _WORSE * before:
-        own.offset = offset
-        keep_steps_only(own)
+        own.offset, own.steps_only = offset, True
+        correct(own, own.discretisation_correction)
         best = fit(own, raw, min(iterations, _LAST), near=True)
     return best
 

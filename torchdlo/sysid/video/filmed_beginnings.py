@@ -14,10 +14,10 @@ import numpy as np
 from torchdlo.sysid.diagnosis.error_floor import gap_rms
 from torchdlo.sysid.diagnosis.workspace import CHAIN
 from torchdlo.sysid.model.rope_model import MAX_SUBSTEP
-from torchdlo.sysid.video.filmed import require_simulated, sharper
+from torchdlo.sysid.video.filmed import corrected, require_simulated, sharper
 from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, fit, gate
 from torchdlo.sysid.video.filmed_model import FilmedModel, Films, extended
-from torchdlo.sysid.video.filmed_problem import FilmedProblem, add_correction, correct
+from torchdlo.sysid.video.filmed_problem import FilmedProblem, correct
 from torchdlo.sysid.video.filmed_starts import restart
 from torchdlo.sysid.video.fit_pool import FitPool
 
@@ -100,15 +100,13 @@ def further(
         found = replace(found, own=own, fit=best)
     if found.own.lasts == begun_with:
         # What a fit that has not come to its end leaves over looks like another effect.
-        found = films.test(found.own, fit(found.own, found.fit.raw, _FOLLOW))
+        found = films.test(found.own, corrected(found.own, found.fit.raw, _FOLLOW))
         report("fitting to its end", 1, 1, f"{1e3 * gap_rms(found.gaps('train')):.2f} mm")
         return alike(first, found), found
-    add_correction(found.own, found.values)
-    found = films.test(found.own, fit(found.own, found.fit.raw, _FOLLOW))
-    plain = first.own.over(whole, found.own.lasts)
     # Both are compared to films with what finer simulations change.
-    add_correction(plain, first.values)
-    return alike(films.test(plain, fit(plain, first.fit.raw, _FOLLOW)), found), found
+    found = films.test(found.own, corrected(found.own, found.fit.raw, _FOLLOW))
+    plain = first.own.over(whole, found.own.lasts)
+    return alike(films.test(plain, corrected(plain, first.fit.raw, _FOLLOW)), found), found
 
 
 def alike(first: FilmedModel, found: FilmedModel) -> FilmedModel:

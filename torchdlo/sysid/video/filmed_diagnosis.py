@@ -26,10 +26,10 @@ from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.recordings.recording import Recording
 from torchdlo.sysid.video.filmed import FILMED_STARTS, baseline
 from torchdlo.sysid.video.filmed_beginnings import NEAR, chain_note, chained, further, left_out, nearer
-from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, fit, look, spread, total
+from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, fit, look, misleading_films, spread, total
 from torchdlo.sysid.video.filmed_model import FilmedModel, Films, extended
-from torchdlo.sysid.video.filmed_problem import FilmedProblem
-from torchdlo.sysid.video.filmed_starts import restart
+from torchdlo.sysid.video.filmed_problem import FilmedProblem, without_rest
+from torchdlo.sysid.video.filmed_starts import fit_starts, restart
 from torchdlo.sysid.video.fit_pool import FitPool
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import overlays
@@ -85,6 +85,9 @@ _EXPLAINED = 2.0
 _LEADERS = 3
 """Candidates that are fitted to all of the time."""
 
+_MOST = 0.7
+"""Share of what the best fit explains of train films from which a law that says more of unseen ones may be true."""
+
 _BEHIND = 2.0
 """Times the cost of the best first fit from which another one is not followed."""
 
@@ -132,13 +135,8 @@ def _diagnosed(
     ties: dict[str, list[str]] = {}
     rounds: list[list[Candidate]] = []
     while len(rounds) < plan.rounds:
-        # What is left beside an effect, and less than finer simulations change, may be an error of theirs.
-        bar = floor.noise if _blunt(level, floor) and not shares else level
         # Ends of films that are left out say that something is missing, also beside what was found.
-        if (
-            base.own.lasts == own.lasts
-            and gap_rms(np.concatenate([base.gaps("train"), base.gaps("test")])) < (MORE if shares else SILENT) * bar
-        ):
+        if base.own.lasts == own.lasts and _nothing_left(base, floor, bool(shares)):
             break
         names = [n for n in effect_library.library() if n not in (*base.own.model.effects, *without)]
         names = [n for n in names if effect_library.applicable(n, recording, base.own.model.mesh)]
@@ -154,7 +152,7 @@ def _diagnosed(
         excess = max(gap_rms(first.gaps("test")) ** 2 - floor.noise**2, 1e-12)
         shares[name] = (gap_rms(base.gaps("test")) ** 2 - gap_rms(found.gaps("test")) ** 2) / excess
         ties[name] = [*rivals, *(_SAME_AT_REST if single and "curvature" in name else ())]
-        base = found
+        base, first = found, _as_counted(first, found)
         if not recording.still:
             first, base = further(films, first, base, given is None, report, pool)
             floor, level = _floor(base)
@@ -167,6 +165,14 @@ def _diagnosed(
         done.limits, done.second_view = list(view.limits.values()), second_view_json(view)
     done.seconds = time.perf_counter() - begun
     return done
+
+
+def _as_counted(first: FilmedModel, found: FilmedModel) -> FilmedModel:
+    """Return the baseline over as much of misleading trials as another model was fitted to."""
+    own = without_rest(first.own, found.own.misleading)
+    if own.misleading == first.own.misleading:
+        return first
+    return replace(first, own=own, fit=look(own, first.fit.raw, own.offset))
 
 
 def _elsewhere(
@@ -195,6 +201,14 @@ def _rescaled(shares: dict[str, float], first: FilmedModel, final: FilmedModel, 
 
 def _floor(base: FilmedModel) -> tuple[ErrorFloor, float]:
     """Return what no effect explains: noise of centre lines, and what steps and mesh may still get wrong."""
+    each = _floors(base)
+    parts = (float(np.sqrt(np.mean([getattr(f, part) ** 2 for f in each]))) for part in ("step", "grid"))
+    floor = ErrorFloor(each[0].noise, *parts)
+    return floor, floor.total
+
+
+def _floors(base: FilmedModel) -> list[ErrorFloor]:
+    """Return the floor of each train trial."""
     own = base.own
     scale = np.mean([0.5 * (v.camera.fx + v.camera.fy) / own.depth(v) for v in own.spines.views])
     parts = []
@@ -203,9 +217,28 @@ def _floor(base: FilmedModel) -> tuple[ErrorFloor, float]:
         moved = np.concatenate([sims, sims + np.nan_to_num(wrong)[None]])
         change = own.spines.changes(moved, np.repeat(values[:, len(own.free) :], 2, 0))
         change = np.where(np.isfinite(own.spines.target), change[1] - change[0], np.nan)
-        parts.append(float(np.sqrt(np.nanmean(change[:, :, : own.spines.priors.start] ** 2))))
-    floor = ErrorFloor(_SPINE / float(scale), *parts)
-    return floor, floor.total
+        parts.append(np.sqrt(np.nanmean(change[:, :, : own.spines.priors.start] ** 2, (1, 2, 3))))
+    step, grid = parts or np.zeros((2, len(own.trials)))
+    return [ErrorFloor(_SPINE / float(scale), float(a), float(b)) for a, b in zip(step, grid, strict=True)]
+
+
+def _nothing_left(base: FilmedModel, floor: ErrorFloor, beside: bool) -> bool:
+    """Return whether the gap is so near the floor, on every train trial and on unseen films, that nothing is missing.
+
+    Args:
+        base: the model.
+        floor: of all trials.
+        beside: whether the model has an effect. What is left beside one, and less than finer simulations change, may
+            be an error of theirs.
+    """
+
+    def small(gap: float, floor: ErrorFloor) -> bool:
+        if beside:
+            return gap < MORE * floor.total
+        return gap < SILENT * (floor.noise if _blunt(floor.total, floor) else floor.total)
+
+    near = all(small(*each) for each in zip(base.gaps("train"), _floors(base), strict=True))
+    return near and small(gap_rms(base.gaps("test")), floor)
 
 
 def _round(
@@ -246,7 +279,9 @@ def _round(
         fits[leading[k]] = found
         report(f"{stage}: fitting on", 1, 1, f"{leading[k]} {1e3 * found.fit.cost:.3f} mm")
     led = sorted(leading, key=lambda n: fits[n].fit.cost)
-    rival = _begun_alike(rival, fits[led[0]])
+    rival, fits = _counted(rival, fits, led)
+    for name in led:
+        rival = _begun_alike(rival, fits[name])
     refused = {name: _refused(rival, fits[name], first, floor, level) for name in led}
     fair = [name for name in led if refused[name] is None]
     best, rivals, reasons = None, [], {name: refused.get(name) or "fits worse" for name in fits}
@@ -256,7 +291,8 @@ def _round(
             min(0.05 * (rival.fit.cost - cost), 0.5 * max(levenberg_marquardt.cost_of(level), cost)),
             1e-12,
         )
-        close = _alike({n: (fits[n].fit.cost, _gain(rival, fits[n], "test", floor)) for n in fair}, tie)
+        fitted, said = ({n: _gain(rival, fits[n], split, floor) for n in fair} for split in ("train", "test"))
+        close = _alike({n: (fits[n].fit.cost, fitted[n], said[n]) for n in fair}, tie)
         chosen = min(close, key=lambda n: len(fits[n].own.free))
         reasons |= dict.fromkeys(close, "as good as the best") | {chosen: "taken"}
         best, rivals = fits[chosen], [n for n in close if n != chosen]
@@ -273,17 +309,18 @@ def _round(
     return best, candidates, rivals
 
 
-def _alike(found: Mapping[str, tuple[float, float]], tie: float) -> list[str]:
+def _alike(found: Mapping[str, tuple[float, float, float]], tie: float) -> list[str]:
     """Return which effects films do not tell from the one that fits best, itself among them.
 
-    A law with more numbers fits better; one that says as much of unseen films, or more, may be the true one as well.
+    A law with more numbers fits better; one that says as much of unseen films, or more, may be the true one as well if
+    it explains most of what that does.
 
     Args:
-        found: costs on train films [m], and shares of the gap of unseen films that are closed, by effect.
+        found: costs on train films [m], and shares of the gap of train and of unseen films that are closed, by effect.
         tie: difference of costs that tells nothing [m].
     """
-    cost, gain = min(found.values())
-    return [n for n, (c, g) in found.items() if c - cost < tie or g >= gain]
+    cost, fitted, said = min(found.values())
+    return [n for n, (c, own, test) in found.items() if c - cost < tie or (test >= said and own >= _MOST * fitted)]
 
 
 def _gain(base: FilmedModel, other: FilmedModel, split: str, floor: ErrorFloor) -> float:
@@ -349,12 +386,33 @@ def _fitted_on(model: FilmedModel, iterations: int, enough: float | None) -> Fil
 
 
 def _begun_alike(rival: FilmedModel, other: FilmedModel) -> FilmedModel:
-    """Return a model with the starts of another one if it fits better with these: starts are no merit of an effect."""
+    """Return a model with the starts of another one of trials that it fits better with these.
+
+    Starts are no merit of an effect.
+    """
     if not rival.own.offset.shape[1]:
         return rival
     own = replace(rival.own, offset=other.own.offset.copy())
-    found = fit(own, rival.fit.raw, _COMPARED)
-    return replace(rival, own=own, fit=found) if found.cost < rival.fit.cost else rival
+    better = fit_starts(own, rival.fit.raw, _COMPARED) < rival.fit.costs
+    if not better.any():
+        return rival
+    own.offset = np.where(better[:, None], own.offset, rival.own.offset)
+    return replace(rival, own=own, fit=fit(own, rival.fit.raw, _COMPARED))
+
+
+def _counted(
+    rival: FilmedModel, fits: dict[str, FilmedModel], led: Sequence[str]
+) -> tuple[FilmedModel, dict[str, FilmedModel]]:
+    """Return models without the rest of trials that none of them follows, their rival and those that lead fitted on."""
+    lost = misleading_films([(m.own, m.fit) for m in (rival, *(fits[name] for name in led))])
+    if not lost:
+        return rival, fits
+
+    def without(model: FilmedModel) -> FilmedModel:
+        own = without_rest(model.own, lost)
+        return replace(model, own=own, fit=fit(own, model.fit.raw, _COMPARED))
+
+    return without(rival), fits | {name: without(fits[name]) for name in led}
 
 
 def _dosed(base: FilmedModel, score: Score, dose: dict[str, float], raw: np.ndarray) -> FilmedModel:

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from torchdlo.sysid.diagnosis.misleading_trials import misleading_trials
+from torchdlo.sysid.diagnosis.misleading_trials import MisleadingTrial, misleading_trials
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import Point
 from torchdlo.sysid.estimation.model_uncertainty import CLAMP_SPREAD, radius_of_clamps, shear_share
@@ -36,12 +36,12 @@ from torchdlo.vision.spine import curve_vectors
 
 __all__ = [
     "Fit",
-    "discount_misleading",
     "film_gaps",
     "fit",
     "gate",
     "intervals",
     "look",
+    "misleading_films",
     "picture_errors",
     "spread",
     "time_films",
@@ -57,8 +57,8 @@ _GATE = 3.0
 _NEAR = 4e-3
 """Distance that is never taken for that of a wrong picture [m]."""
 
-_USUAL = 1e-3
-"""Error of trials that fits follow, at the least [m]."""
+_USUAL, _BEGUN = 1e-3, 0.4
+"""Error of trials that fits follow, at the least [m], and time that tells of their starts alone [s]."""
 
 _LOST = 1.0
 """What a trial costs whose simulation fails [m]."""
@@ -307,8 +307,8 @@ def film_gaps(own: FilmedProblem, found: Fit) -> np.ndarray:
 def gate(own: FilmedProblem, values: np.ndarray) -> int:
     """Take out frames in which films stay far from the rope while others are near; return how many."""
     found, target = own.readings()[0](values[None])[0], own.spines.target
-    lost = 0
-    for view, whole in zip(own.spines.views, _of_views(own), strict=True):
+    good, dropped = [view.good.copy() for view in own.spines.views], {k: list(v) for k, v in own.dropped.items()}
+    for kept, view, whole in zip(good, own.spines.views, _of_views(own), strict=True):
         part = slice(whole.start, whole.start + 2 * view.places.shape[2])
         with np.errstate(invalid="ignore"):
             known = np.isfinite(target[:, :, part, 0])
@@ -321,22 +321,37 @@ def gate(own: FilmedProblem, values: np.ndarray) -> int:
             around = np.array([np.median(distance[b, rows[max(0, k - 4) : k + 5]]) for k in range(len(rows))])
             bad = rows[distance[b, rows] > np.maximum(_GATE * around, _NEAR)]
             if len(bad):
-                view.good[b, bad] = False
-                lost += len(bad)
-                own.dropped.setdefault(f"{trial.name}, camera {view.camera.name}", []).extend(bad.tolist())
+                kept[b, bad] = False
+                dropped.setdefault(f"{trial.name}, camera {view.camera.name}", []).extend(bad.tolist())
+    lost = sum(int((v.good & ~kept).sum()) for v, kept in zip(own.spines.views, good, strict=True))
     if lost:
-        own.spines = Spines(own.spines.views, own.model.dt, own.extent, own.spines.free, own.spines.sure)
+        own.take(replace(own.counting(good), dropped=dropped))
     return lost
 
 
-def discount_misleading(own: FilmedProblem, found: Fit) -> bool:
-    """Take out the rest of trials from where a fit does not follow them though it follows others; return if any was.
+def misleading_films(models: Sequence[tuple[FilmedProblem, Fit]]) -> list[MisleadingTrial]:
+    """Return the trials that none of some fits follows from some time on though fits follow the others.
 
-    A rope that snaps over to the other side than the simulated one tells nothing of its numbers from there on.
+    A rope that snaps over to the other side than the simulated one tells nothing of its numbers from there on. Trials
+    of which less would be left than starts take up count as they are, as do those that are known already.
     """
-    last = own.spines.priors.start
+    own = models[0][0]
+    if own.trials[0].still:
+        return []
     # Cameras may have rates of their own: what they read goes to pictures of the quickest one.
     grid = max((v.time for v in own.spines.views), key=lambda time: time.shape[1])
+    errors = np.stack([_errors_by_picture(problem, found, grid) for problem, found in models])
+    seen = np.isfinite(errors).any(0)
+    last = [int(np.flatnonzero(row).max(initial=-1)) + 1 for row in seen]
+    films = [SimpleNamespace(name=t.name, time=w[:n]) for t, w, n in zip(own.trials, grid, last, strict=True)]
+    names, known = [t.name for t in own.trials], {each.name for each in own.misleading}
+    lost = [each for each in misleading_trials(errors, films, _USUAL) if each.name not in known]
+    return [each for each in lost if _tells(own, names.index(each.name), each.time)]
+
+
+def _errors_by_picture(own: FilmedProblem, found: Fit, grid: np.ndarray) -> np.ndarray:
+    """Return root mean squares of readings [m] by picture of the given times, (B, F); NaN where there are none."""
+    last = own.spines.priors.start
     errors = np.full(grid.shape, np.nan)
     for b, (left, when) in enumerate(zip(found.residual[..., :last], own.spines.times[..., :last], strict=True)):
         seen = np.isfinite(left)
@@ -344,16 +359,13 @@ def discount_misleading(own: FilmedProblem, found: Fit) -> bool:
         count = np.bincount(frame, minlength=grid.shape[1])
         square = np.bincount(frame, left[seen] ** 2, grid.shape[1])
         errors[b, count > 0] = np.sqrt(square[count > 0] / count[count > 0])
-    films = [SimpleNamespace(name=t.name, time=time) for t, time in zip(own.trials, grid, strict=True)]
-    lost = misleading_trials(errors[None], films, _USUAL)
-    for each in lost:
-        b = [t.name for t in own.trials].index(each.name)
-        for view in own.spines.views:
-            view.good[b, view.time[b] >= each.time] = False
-    if lost:
-        own.misleading = (*own.misleading, *lost)
-        own.spines = Spines(own.spines.views, own.model.dt, own.extent, own.spines.free, own.spines.sure)
-    return bool(lost)
+    return errors
+
+
+def _tells(own: FilmedProblem, b: int, seconds: float) -> bool:
+    """Return whether the beginning of a trial tells more than how it began, in every view."""
+    pictures = min(int((v.good[b] & (v.time[b] < seconds)).sum()) for v in own.spines.views)
+    return seconds > _BEGUN and pictures > 2
 
 
 def time_films(own: FilmedProblem, values: np.ndarray) -> None:

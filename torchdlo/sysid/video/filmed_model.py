@@ -12,8 +12,8 @@ from torchdlo.sysid.estimation.observation import FilmView, Spines, unfitted_clo
 from torchdlo.sysid.recordings.recording import Trial
 from torchdlo.sysid.video.filmed import test_problem
 from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, time_films
-from torchdlo.sysid.video.filmed_problem import FilmedProblem, first_frames
-from torchdlo.sysid.video.filmed_starts import begin_anew, fit_starts
+from torchdlo.sysid.video.filmed_problem import FilmedProblem, add_correction, first_frames
+from torchdlo.sysid.video.filmed_starts import follow_starts
 
 __all__ = ["FilmedModel", "Films", "extended"]
 
@@ -41,9 +41,9 @@ class FilmedModel:
             return film_gaps(self.own, self.fit)
         if self._tested is None:
             here = self.test
-            if here.offset.shape[1]:
-                costs = fit_starts(here, self.fit.raw, 3)
-                begin_anew(here, self.fit.raw, costs)
+            # Neither starts nor what finer simulations change are those of another model.
+            add_correction(here, self.values)
+            follow_starts(here, self.fit.raw)
             time_films(here, self.values)
             read = here.spines.read(here.simulate(self.values[None]), self.values[None, len(here.free) :])[0]
             residual = np.where(np.isfinite(here.spines.target), read, np.nan)[:, :, : here.spines.priors.start, 0]

@@ -31,8 +31,8 @@ __all__ = [
     "correct",
     "filmed_problem",
     "first_frames",
-    "keep_steps_only",
     "start_of",
+    "without_rest",
 ]
 
 STRETCHES = 14
@@ -73,6 +73,8 @@ class FilmedProblem:
     """Those smooth shapes at the places of the rope, of size one, shape (M, J / 6)."""
     sizes: dict[str, float] = field(default_factory=dict)
     """What counts as much of some numbers, in the terms of their scale."""
+    steps_only: bool = False
+    """Whether corrections are what finer steps change alone: where ropes bifurcate, another mesh tells nothing."""
 
     @property
     def lasts(self) -> float:
@@ -114,6 +116,12 @@ class FilmedProblem:
         parts: dict[str, Any] = {"trials": trials, "motion": self.motion.pick(rows), "spines": spines}
         return replace(self, **parts, start=self.start.pick(rows), offset=self.offset[rows], dropped={})
 
+    def counting(self, good: Sequence[np.ndarray]) -> FilmedProblem:
+        """Return the problem in which these pictures count, (B, F) by view."""
+        old = self.spines
+        views = [replace(v, good=g) for v, g in zip(old.views, good, strict=True)]
+        return replace(self, spines=Spines(views, old.step, old.extent, old.free, old.sure))
+
     def shortened(self, seconds: float) -> FilmedProblem:
         """Return the problem of the first seconds of all trials."""
         count = int(np.ceil(seconds / self.model.dt)) + 1
@@ -125,16 +133,23 @@ class FilmedProblem:
         trials = first_frames(self.trials, count)
         views = [v.shortened(seconds) for v in self.spines.views]
         spines = Spines(views, self.model.dt, self.extent, self.spines.free, self.spines.sure)
-        start = replace(self.start, discretisation_correction=None if found is None else found.correction)
+        start = replace(self.start, discretisation_correction=self.added(found))
         parts: dict[str, Any] = {"trials": trials, "motion": self.model.motion(trials), "spines": spines}
         return replace(self, **parts, start=start, discretisation_correction=found)
 
     def over(self, whole: FilmedProblem, seconds: float) -> FilmedProblem:
         """Return the problem with the first seconds of the trials of another one; corrections are not known there."""
-        spines = Spines(whole.spines.views, self.model.dt, self.extent, self.spines.free, self.spines.sure)
+        views = []
+        for known, view in zip(self.spines.views, whole.spines.views, strict=True):
+            good = view.good.copy()
+            # Wrong pictures stay so.
+            good[:, : known.good.shape[1]] &= known.good
+            views.append(replace(view, good=good))
+        spines = Spines(views, self.model.dt, self.extent, self.spines.free, self.spines.sure)
         parts: dict[str, Any] = {"trials": whole.trials, "motion": self.model.motion(whole.trials), "spines": spines}
         start = replace(self.start, discretisation_correction=None)
-        return replace(self, **parts, start=start, discretisation_correction=None).shortened(seconds)
+        longer = replace(self, **parts, start=start, discretisation_correction=None)
+        return without_rest(longer, self.misleading).shortened(seconds)
 
     def weigh(self, residual: np.ndarray) -> None:
         """Take for what readings get wrong what a model of a rope at rest leaves of them (B, F, R) [m].
@@ -145,6 +160,12 @@ class FilmedProblem:
         square = KNEE * np.nanmean(left**2 * levenberg_marquardt.robust(left)[1]) * INDEPENDENT / STRETCHES
         sure, old = max(SURE, float(np.sqrt(square))), self.spines
         self.spines = Spines(old.views, old.step, old.extent, old.free, sure)
+
+    def added(self, found: Refinement | None) -> np.ndarray | None:
+        """Return what is added to simulations [m], (B, F, M, 3), where this is known of finer ones; nothing if not."""
+        if found is None:
+            return None
+        return (replace(found, grid=np.zeros_like(found.grid)) if self.steps_only else found).correction
 
     def take(self, other: FilmedProblem) -> None:
         """Become another problem."""
@@ -381,13 +402,15 @@ def add_correction(own: FilmedProblem, values: np.ndarray) -> None:
 def correct(own: FilmedProblem, found: Refinement | None) -> None:
     """Add to simulations from now on what is known of finer ones."""
     own.discretisation_correction = found
-    own.start = replace(own.start, discretisation_correction=None if found is None else found.correction)
+    own.start = replace(own.start, discretisation_correction=own.added(found))
 
 
-def keep_steps_only(own: FilmedProblem) -> None:
-    """Correct simulations by what finer steps change alone: where ropes bifurcate, another mesh tells nothing."""
-    found = own.discretisation_correction
-    if found is None:
-        return
-    alone = replace(found, grid=np.zeros_like(found.grid))
-    own.start = replace(own.start, discretisation_correction=alone.correction)
+def without_rest(own: FilmedProblem, lost: Sequence[MisleadingTrial]) -> FilmedProblem:
+    """Return the problem in which trials count up to where they mislead."""
+    good, names = [view.good.copy() for view in own.spines.views], [t.name for t in own.trials]
+    for each in lost:
+        b = names.index(each.name)
+        for kept, view in zip(good, own.spines.views, strict=True):
+            kept[b, view.time[b] >= each.time] = False
+    known = {each.name for each in lost}
+    return replace(own.counting(good), misleading=(*(m for m in own.misleading if m.name not in known), *lost))

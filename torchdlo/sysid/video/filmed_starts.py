@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -22,7 +23,6 @@ from torchdlo.sysid.video.filmed_problem import FilmedProblem, begin_from_balanc
 
 __all__ = [
     "START_WINDOW",
-    "begin_anew",
     "fit_starts",
     "refine_start",
     "restart",
@@ -147,33 +147,34 @@ def restart(own: FilmedProblem, found: Fit, iterations: int, enough: float = _LO
         iterations: most steps of each improvement.
         enough: cost [m] from which a trial may have a wrong start; less if it stands out.
     """
-    for _ in range(_RESTARTS):
-        if not begin_anew(own, found.raw, found.costs, enough):
+    for _ in range(_RESTARTS if own.offset.shape[1] else 0):
+        lost = np.flatnonzero(~own.start.at_rest & ~(found.costs < min(enough, _standing_out(found.costs))))
+        if not len(lost):
             break
+        part = own.picked(lost)
+        search_starts(part, found.raw, seconds=start_window(part))
+        costs = fit_starts(part, found.raw, 8)
+        better = costs < _PAYS * found.costs[lost]
+        if not better.any():
+            break
+        own.offset = own.offset.copy()
+        own.offset[lost[better]] = part.offset[better]
         found = fit(own, found.raw, iterations)
     return found
 
 
-def begin_anew(own: FilmedProblem, raw: np.ndarray, costs: np.ndarray, enough: float = _LOST) -> bool:
-    """Look for other starts of lost trials of the problem, which are set to those that are better; return if any is.
+def follow_starts(own: FilmedProblem, raw: np.ndarray) -> None:
+    """Set the starts of the problem to the better ones of two ways there: from where they are, and from balance.
 
-    Args:
-        own: the problem.
-        raw: coordinates (N,), which stay as they are.
-        costs: of its trials [m], shape (B,).
-        enough: cost [m] from which a trial may have a wrong start; less if it stands out.
+    From balance they are followed over more and more of the time. Numbers (N,) stay as they are.
     """
     if not own.offset.shape[1]:
-        return False
-    lost = np.flatnonzero(~own.start.at_rest & ~(costs < min(enough, _standing_out(costs))))
-    if not len(lost):
-        return False
-    part = own.picked(lost)
-    search_starts(part, raw, seconds=start_window(part))
-    better = fit_starts(part, raw, 8) < _PAYS * costs[lost]
-    own.offset = own.offset.copy()
-    own.offset[lost[better]] = part.offset[better]
-    return bool(better.any())
+        return
+    fresh, window = replace(own, offset=np.zeros_like(own.offset)), start_window(own)
+    costs = fit_starts(own, raw, 8)
+    for seconds in (window, 2 * window, None):
+        found = fit_starts(fresh, raw, 8, seconds=seconds)
+    own.offset = np.where((found < costs)[:, None], fresh.offset, own.offset)
 
 
 def _standing_out(costs: np.ndarray) -> float:
