@@ -31,6 +31,9 @@ def test_torchscript_acts_the_same(tmp_path: Path, memory: bool):
     export(policy, tmp_path / "policy.ts")
     read = torch.jit.load(str(tmp_path / "policy.ts"))
     torch.testing.assert_close(read(*given), policy.act(*given))
+    # Features are picked by their places: these would be found in wider observations, too.
+    with pytest.raises(RuntimeError, match="invalid for input of size"):
+        read(torch.randn(5, 9), given[1], torch.randn(5, 9))
 
 
 def test_onnx_acts_the_same(tmp_path: Path):

@@ -2,7 +2,7 @@
 
 What is written takes what an environment observes, as float32: "observation" (N, O), "progress" (N, 1), the share of
 the episode that is over, and "start" (N, O), what was observed at the start. It returns "action" (N, A) in metres and
-degrees, the middle of what the policy could do. The normaliser is part of it.
+degrees, the middle of what the policy could do. The normaliser is part of it. Observations of another size are refused.
 """
 
 from __future__ import annotations
@@ -33,6 +33,9 @@ class _Acts(nn.Module):
         self.policy = policy
 
     def forward(self, observation: Tensor, progress: Tensor, start: Tensor) -> Tensor:
+        # What is traced checks nothing else: wider observations would be read in the wrong places.
+        shape = (progress.shape[0], self.policy.spec.features.size)
+        observation, start = observation.reshape(shape), start.reshape(shape)
         action = self.policy.command(self.policy.mean(self.policy.features(observation, progress, start)))
         # An input that nothing depends on would be dropped.
         return action + 0.0 * start[:, :1]
