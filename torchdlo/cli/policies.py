@@ -239,14 +239,16 @@ def _hybrid(
 
 
 def _searched(task: Task, seed: int, out: Path) -> Path:
-    """Return the file of a trajectory that is searched now, or was before."""
+    """Return the file of a trajectory that is searched now, or was before with the same seed."""
     from torchdlo.agents.trajopt.presets import search_preset
     from torchdlo.agents.trajopt.search import optimize
     from torchdlo.agents.trajopt.search_result import result_json, trajectory_json
     from torchdlo.agents.trajopt.task_problem import TaskProblem
 
     file = out / "search" / "trajectory.json"
-    if file.exists():
+    result = file.with_name("result.json")
+    if file.exists() and result.exists() and json.loads(result.read_text())["settings"]["seed"] == seed:
+        typer.echo(f"search: {file} is taken, which was searched before with this seed", err=True)
         return file
     problem, chosen = TaskProblem(task), search_preset(task.name, "hybrid", seed=seed, episodes=1200)
     journal = out / "search" / "journal"
@@ -259,7 +261,7 @@ def _searched(task: Task, seed: int, out: Path) -> Path:
             f"{task.name}: the search found no trajectory that succeeds; give one with --trajectory, or another --seed."
         )
     write_atomically(file, trajectory_json(found, problem))
-    write_atomically(file.with_name("result.json"), result_json(found, problem, chosen))
+    write_atomically(result, result_json(found, problem, chosen))
     return file
 
 

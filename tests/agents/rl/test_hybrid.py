@@ -195,6 +195,30 @@ def test_ctrl_c_ends_the_search_of_a_trajectory(tmp_path: Path, monkeypatch: pyt
     assert not (tmp_path / "x" / "search" / "trajectory.json").exists()
 
 
+def test_an_earlier_search_is_taken_if_its_seed_was_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    from torchdlo.agents.trajopt import search
+
+    monkeypatch.setitem(envs.TASKS, "lead", Lead)
+    searches: list[int] = []
+
+    def stop(problem, settings, **_):
+        searches.append(settings.seed)
+        return SimpleNamespace(interrupted=True, outcome=SimpleNamespace(success=torch.tensor([True])))
+
+    monkeypatch.setattr(search, "optimize", stop)
+    monkeypatch.setattr(stages, "train_hybrid", lambda *_, **__: (None, {}))
+    folder = tmp_path / "search"
+    folder.mkdir()
+    (folder / "trajectory.json").write_text("{}")
+    (folder / "result.json").write_text(json.dumps({"settings": {"seed": 3}}))
+    for seed, code in ((3, (0, None)), (4, (130,))):
+        with pytest.raises(SystemExit) as done:
+            app.main(["train", "lead", "--out", str(tmp_path), "--seed", str(seed)])
+        assert done.value.code in code
+        assert ("which was searched before" in capsys.readouterr().err) == (seed == 3)
+    assert searches == [4]
+
+
 class Vain(Lead):
     """Nothing succeeds here."""
 
