@@ -13,11 +13,12 @@ from torchdlo.sysid.diagnosis.workspace import CHAIN
 from torchdlo.sysid.estimation.observation import FilmView, Spines
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.recording import Recording, Trial, load_recording
-from torchdlo.sysid.video.filmed_beginnings import NEAR, _followed, nearer
-from torchdlo.sysid.video.filmed_diagnosis import _scores
+from torchdlo.sysid.video import filmed_beginnings
+from torchdlo.sysid.video.filmed_beginnings import NEAR, _followed, _links_tell, chained, nearer
 from torchdlo.sysid.video.filmed_fit import film_gaps, fit
-from torchdlo.sysid.video.filmed_model import Films
+from torchdlo.sysid.video.filmed_model import FilmedModel, Films
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, add_correction, filmed_problem, start_of
+from torchdlo.sysid.video.filmed_scores import film_scores
 from torchdlo.sysid.video.films import with_stations
 from torchdlo.sysid.video.fit_pool import FitPool
 from torchdlo.vision.camera import lens, looking_at, project
@@ -98,6 +99,20 @@ def test_a_chain_is_not_corrected_for_its_mesh() -> None:
         assert found is not None and abs(found.wrong - wrong) < 1e-6 and np.abs(found.grid).max() > 0
 
 
+def test_links_are_fitted_where_they_may_explain_something(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To first order a chain of twice as long links tells of them; a rope with a mass on it does not."""
+    monkeypatch.setattr(filmed_beginnings, "_as_chain", lambda *_: pytest.fail("fitted"))
+    recording, told = gripped(0.6, 1), []
+    link = float(np.diff(RopeModel(recording, **OPTIONS).arclength).min())
+    for effects in ({f"{CHAIN}.length": 2 * link}, MASS):
+        own = filmed(recording, effects)
+        best = fit(own, own.space.to_raw(np.concatenate([own.fixed, np.zeros(8)])), 4)
+        told.append(any(_links_tell(FilmedModel(own, best, own), length) for length in (link, -link)))
+    assert told == [True, False]
+    plain = FilmedModel(own, best, own)
+    assert chained(plain, FitPool(1)) is plain
+
+
 def test_a_wrong_picture_does_not_end_what_is_followed() -> None:
     whole = filmed(gripped(0.5, 1), {})
     whole.spines.views[0].places[0, 14] += 90.0
@@ -119,6 +134,6 @@ def test_beginnings_lead_to_a_mass_that_is_missing() -> None:
     base = nearer(films, best, lambda *_: None)
     assert base.own.lasts < whole.lasts
     names = ["point_mass", "nonuniform_stiffness", "rest_curvature", "air_drag", "gripper_compliance"]
-    leads = [s.name for s in _scores(base, names, base.own.lasts, lambda *_: None, FitPool(1))]
+    leads = [s.name for s in film_scores(base, names, base.own.lasts, lambda *_: None, FitPool(1))]
     # Those that lead are fitted next. A soft spot does nearly as well; which of them is first differs by machine.
     assert "point_mass" in leads[:2]

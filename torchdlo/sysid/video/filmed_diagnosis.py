@@ -13,10 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from torchdlo.physics.effects.parameter_name import ParameterName
-from torchdlo.sysid.diagnosis import effect_library, score_test
+from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
 from torchdlo.sysid.diagnosis.detection_limit import limit_gap
-from torchdlo.sysid.diagnosis.effect_library import Perturbation
 from torchdlo.sysid.diagnosis.error_floor import ErrorFloor, gap_rms
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, verdict_word
@@ -26,9 +25,10 @@ from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.recordings.recording import Recording
 from torchdlo.sysid.video.filmed import FILMED_STARTS, baseline
 from torchdlo.sysid.video.filmed_beginnings import NEAR, chain_note, chained, further, left_out, nearer
-from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, fit, look, misleading_films, spread, total
+from torchdlo.sysid.video.filmed_fit import film_gaps, fit, look, misleading_films, spread, total
 from torchdlo.sysid.video.filmed_model import FilmedModel, Films, extended
-from torchdlo.sysid.video.filmed_problem import FilmedProblem, without_rest
+from torchdlo.sysid.video.filmed_problem import without_rest
+from torchdlo.sysid.video.filmed_scores import film_scores
 from torchdlo.sysid.video.filmed_starts import fit_starts, restart
 from torchdlo.sysid.video.fit_pool import FitPool
 from torchdlo.sysid.video.footage import views_of
@@ -255,7 +255,7 @@ def _round(
 ) -> tuple[FilmedModel | None, list[Candidate], list[str]]:
     """Return the model with the best effect added, if one pays, all candidates, and effects that fit as well."""
     short = base.own.lasts if base.own.lasts < whole else _SHORT * whole
-    scores = _scores(base, names, short, lambda k, n: report(f"{stage}: screening", k, n, ""), pool)
+    scores = film_scores(base, names, short, lambda k, n: report(f"{stage}: screening", k, n, ""), pool)
     tried = scores[: plan.candidates]
     if not tried:
         return None, [], []
@@ -296,12 +296,14 @@ def _round(
         chosen = min(close, key=lambda n: len(fits[n].own.free))
         reasons |= dict.fromkeys(close, "as good as the best") | {chosen: "taken"}
         best, rivals = fits[chosen], [n for n in close if n != chosen]
+    closed = {name: _gain(rival, fits[name], "train", floor) for name in led}
     candidates = [
         Candidate(
             s.name,
             s.share,
-            _gain(rival, fits[s.name], "train", floor) if s.name in led else None,
-            _gain(rival, fits[s.name], "test", floor) if s.name in led else None,
+            closed.get(s.name),
+            # Starts of unseen films take as long as a fit: what does not pay on others is not asked for them.
+            _gain(rival, fits[s.name], "test", floor) if s.name == led[0] or closed.get(s.name, 0) >= PAYS else None,
             reasons.get(s.name, "its doses explain less"),
         )
         for s in scores
@@ -427,92 +429,6 @@ def _upright(model: FilmedModel) -> FilmedModel:
     """Return a model that begins with cameras as they were calibrated."""
     numbers = np.arange(model.fit.raw.size) < len(model.own.free)
     return replace(model, fit=replace(model.fit, raw=np.where(numbers, model.fit.raw, 0.0)))
-
-
-def _tangents(own: FilmedProblem, here: Fit, seen: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return what numbers, cameras and starts can change of weighted readings, (R + N, N), their priors below."""
-    count, moving = here.raw.size, here.offset.shape[1]
-    columns = [(here.jacobian[:, k] * weight)[seen] for k in range(count)]
-    for b in range(len(seen)):
-        only = np.zeros_like(weight)
-        only[b] = weight[b]
-        columns += [] if own.start.at_rest[b] else [(here.jacobian[:, count + k] * only)[seen] for k in range(moving)]
-    jacobian = np.stack(columns, 1).astype(float)
-    priors = np.zeros((jacobian.shape[1], jacobian.shape[1]))
-    per_trial = float(seen.sum()) / len(seen)
-    priors[range(count, len(priors)), range(count, len(priors))] = np.sqrt(own.prior.mean() * per_trial)
-    return np.concatenate([jacobian, priors])
-
-
-def _scores(
-    base: FilmedModel, names: Sequence[str], seconds: float, report: Callable[[int, int], None], pool: FitPool
-) -> list[Score]:
-    """Return the scores of effects, best first: what their doses explain beyond what all other numbers can.
-
-    Args:
-        base: the model.
-        names: effects to try.
-        seconds: over which films are compared.
-        report: told how many groups are done, and in all.
-        pool: who simulates them.
-    """
-    own, values = base.own, base.values
-    here = look(own, base.fit.raw, own.offset, seconds)
-    known = dict(zip(own.model.parameters, own.full(values[None])[0], strict=True))
-    sims = own.simulate(values[None])
-    step = max(1, sims.shape[2] // 50)
-    curved = score_test.curvature_scale(sims[0][:, ::step])
-    doses = {n: effect_library.perturbations(n, own.model.recording, own.model.mesh, curved, known) for n in names}
-    groups = score_test.groups_of(names, doses)
-    seen = np.isfinite(here.residual)
-    weight = np.where(seen, 1 / (np.nan_to_num(here.residual) ** 2 + levenberg_marquardt.KNEE**2) ** 0.25, 0.0)
-    left, count = -(np.nan_to_num(here.residual) * weight)[seen], here.raw.size
-    q, r = np.linalg.qr(_tangents(own, here, seen, weight))
-    pad = np.zeros(len(q) - len(left))
-    left = np.concatenate([left, pad])
-    left = left - q @ (q.T @ left)
-    scores = []
-    report(0, len(groups))
-    probed = [(own, values, {n: doses[n] for n in group}, seconds) for group in groups]
-    for done, (g, read) in enumerate(pool.map(_dose_readings, probed)):
-        owner = [name for name in groups[g] for _ in doses[name]]
-        for name in groups[g]:
-            picked = [k + 1 for k, o in enumerate(owner) if o == name]
-            change = np.stack(
-                [np.concatenate([np.nan_to_num((read[k] - read[0]) * weight)[seen], pad]) for k in picked], 1
-            )
-            absorbed = q.T @ change
-            mixtures = score_test._mixtures(doses[name], change - q @ absorbed, left)
-            starts = []
-            for found in mixtures[: score_test._PLACES]:
-                back = np.linalg.lstsq(r, absorbed @ found.amounts, rcond=1e-6)[0][:count]
-                for share in score_test._ON_THE_WAY:
-                    raw = here.raw - np.clip(share * back, -1.0, 1.0)
-                    starts.append((score_test._mixture(name, doses[name], share * found.amounts), raw))
-            best, sizes = mixtures[0], score_test._sizes(name, doses[name])
-            scores.append(Score(name, best.share, starts[0][0], tuple(starts), sizes, best.direction))
-        report(done + 1, len(groups))
-    return sorted(scores, key=lambda s: (-s.share, s.name))
-
-
-def _dose_readings(
-    own: FilmedProblem, values: np.ndarray, doses: Mapping[str, Sequence[Perturbation]], seconds: float
-) -> np.ndarray:
-    """Return readings at the numbers (N,) of a problem and with each dose of some effects, (1 + doses, B, F, R)."""
-    known = dict(zip(own.model.parameters, own.full(values[None])[0], strict=True))
-    more = own.with_effects((*own.model.effects, *doses), {}, [])
-    more.fixed[:] = [known.get(n, f) for n, f in zip(more.model.parameters, more.fixed, strict=True)]
-    rows = [more.fixed.copy()]
-    for probes in doses.values():
-        for probe in probes:
-            rows.append(more.fixed.copy())
-            for key, value in probe.values.items():
-                rows[-1][more.model.parameters.index(key)] = value
-    every = replace(more, free=tuple(range(len(more.fixed))))
-    cameras = np.repeat(values[None, len(own.free) :], len(rows), 0)
-    offsets = np.repeat(own.offset[None], len(rows), 0)
-    moved = every.simulate(np.concatenate([np.stack(rows), cameras], 1), own.frames(seconds), offsets)
-    return own.spines.changes(moved, cameras)[..., 0]
 
 
 def _concluded(
