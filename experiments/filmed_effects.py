@@ -102,8 +102,6 @@ def kept(row: dict[str, Any]) -> dict[str, Any]:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Return rows as Markdown, and how often findings are right, with 90 % bounds by counting (Clopper-Pearson)."""
-    from scipy.stats import binomtest
-
     lines = [
         "| films | cameras | hidden | named | or | gap before, after [mm] | CPU s |",
         "|---|---|---|---|---|---|---|",
@@ -116,12 +114,24 @@ def table(rows: list[dict[str, Any]]) -> str:
             f"{gap[0]:.2f}, {gap[1]:.2f} | {row['cpu_s']:.0f} |"
         )
     lines.append("")
-    for what, wanted in (("something hidden", True), ("nothing hidden", False)):
-        some = [row["right"] for row in rows if bool(row["hidden"]) == wanted]
-        if some:
-            ends = binomtest(int(sum(some)), len(some)).proportion_ci(0.9)
-            lines.append(f"{what}: {sum(some)} of {len(some)} right, {ends.low:.0%} to {ends.high:.0%}")
+    some, none = ([row for row in rows if bool(row["hidden"]) == wanted] for wanted in (True, False))
+    said = {f"something hidden, {n} camera{'s' * (n > 1)}": [r for r in some if r["cameras"] == n] for n in (2, 1)}
+    for what, each in said.items():
+        lines += [_rate(f"{what}: named", [set(r["hidden"]) <= {*r["named"], *r["or"]} for r in each])]
+        lines += [_rate(f"{what}: named, and nothing else", [r["right"] for r in each])]
+    lines += [_rate("nothing hidden: nothing named", [not r["named"] for r in none])]
+    lines += [_rate("nothing hidden: said to be explained", [r["right"] for r in none])]
     return "\n".join(lines)
+
+
+def _rate(what: str, right: list[bool]) -> str:
+    """Return how often something is so, with its 90 % bounds."""
+    from scipy.stats import binomtest
+
+    if not right:
+        return f"{what}: none tried"
+    ends = binomtest(sum(right), len(right)).proportion_ci(0.9)
+    return f"{what}: {sum(right)} of {len(right)}, {ends.low:.0%} to {ends.high:.0%}"
 
 
 def main() -> None:
