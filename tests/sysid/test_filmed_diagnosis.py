@@ -114,3 +114,29 @@ def test_a_rival_takes_the_starts_of_trials_that_it_fits_better_with(monkeypatch
         else:
             assert found.fit == "fitted on" and found.own.offset[:, 0].tolist() == taken
     assert not own.offset.any() and other.offset.all()
+
+
+def test_effects_are_fitted_from_ropes_in_balance_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Starts of a baseline make up for what it lacks: they are forgotten, and followed over longer and longer times."""
+    none: Any = None
+    own = FilmedProblem(none, (), none, none, none, (), np.zeros(0), {})
+    model = FilmedModel(own, SimpleNamespace(raw=np.zeros(1)), own)
+    assert filmed_diagnosis._afresh(model, 1.4) == []
+    own.offset, asked = np.ones((2, 6)), []
+
+    def fitted(problem: FilmedProblem, raw: np.ndarray, *_: Any, seconds: float, **__: Any) -> Any:
+        asked.append((problem.offset.max(), float(raw[0]), seconds))
+        problem.offset = problem.offset + 0.5
+        return SimpleNamespace(raw=raw + 1)
+
+    for name in ("correct", "add_correction"):
+        monkeypatch.setattr(filmed_diagnosis, name, lambda *_: None)
+    monkeypatch.setattr(filmed_diagnosis, "start_window", lambda _: 0.4)
+    monkeypatch.setattr(filmed_diagnosis, "fit_starts", fitted)
+    monkeypatch.setattr(filmed_diagnosis, "fit", fitted)
+    monkeypatch.setattr(filmed_diagnosis, "look", lambda problem, raw, *_: SimpleNamespace(raw=raw, cost=1e-4))
+    monkeypatch.setattr(FilmedProblem, "space", SimpleNamespace(to_values=lambda raw: raw))
+    (found,) = filmed_diagnosis._afresh(model, 1.4)
+    assert [(offset, raw) for offset, raw, _ in asked] == [(0, 0), (0.5, 0), (1.0, 1), (1.5, 2)]
+    np.testing.assert_allclose([seconds for *_, seconds in asked], [0.2, 0.4, 0.9, 1.4])
+    assert found.fit.raw[0] == 3 and found.own.offset.max() == 2.0 and (own.offset == 1).all()

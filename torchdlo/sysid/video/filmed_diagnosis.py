@@ -27,9 +27,9 @@ from torchdlo.sysid.video.filmed import FILMED_STARTS, baseline
 from torchdlo.sysid.video.filmed_beginnings import NEAR, chain_note, chained, further, left_out, nearer
 from torchdlo.sysid.video.filmed_fit import film_gaps, fit, look, misleading_films, spread, total
 from torchdlo.sysid.video.filmed_model import FilmedModel, Films, extended
-from torchdlo.sysid.video.filmed_problem import without_rest
+from torchdlo.sysid.video.filmed_problem import add_correction, correct, without_rest
 from torchdlo.sysid.video.filmed_scores import film_scores
-from torchdlo.sysid.video.filmed_starts import fit_starts, restart
+from torchdlo.sysid.video.filmed_starts import fit_starts, restart, start_window
 from torchdlo.sysid.video.fit_pool import FitPool
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import overlays
@@ -75,6 +75,9 @@ _SIGNS, _KEPT = (1.0, -1.0), 3
 
 _AS_GOOD = 1.1
 """Times what the best fit leaves on test trials up to which another one's numbers may be the true ones as well."""
+
+_ROUGH, _AFRESH = 1e-2, 6
+"""Share of the cost that another step of a first fit has to save, and most steps of each of those that begin afresh."""
 
 _COMPARED = 3
 """Most steps of the fits of a baseline that leading models are compared with."""
@@ -371,7 +374,25 @@ def _fitted(base: FilmedModel, score: Score, iterations: int, seconds: float) ->
         read = start.own.spines.read(sims, values[:, len(start.own.free) :])
         costs.append(levenberg_marquardt.costs(read, target, start.own.extent)[0])
     best = starts[int(np.argmin(costs))]
-    return replace(best, fit=fit(best.own, best.fit.raw, iterations, seconds=seconds))
+    near = replace(best, fit=fit(best.own, best.fit.raw, iterations, seconds=seconds, tolerance=_ROUGH))
+    return min((near, *_afresh(best, seconds)), key=lambda model: total(model.fit))
+
+
+def _afresh(model: FilmedModel, seconds: float) -> list[FilmedModel]:
+    """Return a fit of trials in motion from ropes in balance, over more and more of the first seconds; none of others.
+
+    Starts of a baseline make up for what it lacks, and small steps from there may not lead back.
+    """
+    if not model.own.offset.shape[1]:
+        return []
+    own, raw = replace(model.own, offset=np.zeros_like(model.own.offset)), model.fit.raw
+    correct(own, None)
+    window = min(start_window(own), seconds)
+    fit_starts(own, raw, 3, seconds=0.5 * window)
+    for until in (window, 0.5 * (window + seconds), seconds):
+        raw = fit(own, raw, _AFRESH, seconds=until, tolerance=_ROUGH).raw
+    add_correction(own, own.space.to_values(raw))
+    return [replace(model, own=own, fit=look(own, raw, own.offset, seconds))]
 
 
 def _fitted_on(model: FilmedModel, iterations: int, enough: float | None) -> FilmedModel:
