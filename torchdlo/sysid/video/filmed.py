@@ -308,13 +308,14 @@ def _fitted(own: FilmedProblem, raw: np.ndarray, iterations: int, report: Callba
         return best
     best = restart(own, fit(own, best.raw, iterations), iterations)
     # A diagnosis asks what effects say of a trial before it takes one for misleading.
-    judge = _discounted if not np.isfinite(near) else lambda _, found, __: found
-    best = judge(own, best, iterations)
+    alone = not np.isfinite(near)
+    best = _discounted(own, best, iterations) if alone else best
     report(stage, 2, 3, f"{1e3 * best.cost:.2f} mm")
     if not np.isfinite(best.cost):
         return best
     # A rope may snap over to another side with other steps.
-    best = clocked(own, judge(own, sharper(own, best.raw, iterations), iterations), iterations)
+    best = sharper(own, best.raw, iterations)
+    best = clocked(own, _discounted(own, best, iterations) if alone else best, iterations)
     report(stage, 3, 3, f"{1e3 * best.cost:.2f} mm")
     return best
 
@@ -379,7 +380,7 @@ def corrected(own: FilmedProblem, raw: np.ndarray, iterations: int) -> Fit:
 
 
 def _finer(own: FilmedProblem, raw: np.ndarray, iterations: int, before: float) -> Fit:
-    """Return the fit with what finer simulations change; and not their mesh if that costs more than before.
+    """Return the fit with what finer simulations change, of their steps alone if their mesh costs more than before.
 
     Args:
         own: the problem, of trials in motion.

@@ -44,9 +44,8 @@ class LeftOver:
         for b in range(len(self.seen)):
             only = np.zeros_like(self.weight)
             only[b] = self.weight[b]
-            columns += (
-                [] if own.start.at_rest[b] else [(here.jacobian[:, count + k] * only)[self.seen] for k in range(moving)]
-            )
+            if not own.start.at_rest[b]:
+                columns += [(here.jacobian[:, count + k] * only)[self.seen] for k in range(moving)]
         jacobian = np.stack(columns, 1).astype(float)
         priors = np.zeros((jacobian.shape[1], jacobian.shape[1]))
         per_trial = float(self.seen.sum()) / len(self.seen)
