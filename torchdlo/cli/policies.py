@@ -13,7 +13,7 @@ from torchdlo.cli.options import ExecutionOption, execution_choice
 from torchdlo.cli.progress import at_work, deferred_interrupt, progress
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
-from torchdlo.untrusted import parse_json
+from torchdlo.untrusted import parse_json, read_entry
 
 if TYPE_CHECKING:
     from torchdlo.agents.rl.settings import TrainingSettings
@@ -247,7 +247,7 @@ def _searched(task: Task, seed: int, out: Path) -> Path:
 
     file = out / "search" / "trajectory.json"
     result = file.with_name("result.json")
-    if file.exists() and result.exists() and json.loads(result.read_text())["settings"]["seed"] == seed:
+    if file.exists() and result.exists() and _seed_of(result) == seed:
         typer.echo(f"search: {file} is taken, which was searched before with this seed", err=True)
         return file
     problem, chosen = TaskProblem(task), search_preset(task.name, "hybrid", seed=seed, episodes=1200)
@@ -263,6 +263,10 @@ def _searched(task: Task, seed: int, out: Path) -> Path:
     write_atomically(file, trajectory_json(found, problem))
     write_atomically(result, result_json(found, problem, chosen))
     return file
+
+
+def _seed_of(result: Path) -> int:
+    return read_entry(result, "a result of a search")["settings"]["seed"].whole()
 
 
 def evaluate(

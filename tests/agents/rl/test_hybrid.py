@@ -217,6 +217,11 @@ def test_an_earlier_search_is_taken_if_its_seed_was_the_same(tmp_path: Path, mon
         assert done.value.code in code
         assert ("which was searched before" in capsys.readouterr().err) == (seed == 3)
     assert searches == [4]
+    (folder / "result.json").write_text('{"settings": {"se')
+    with pytest.raises(SystemExit) as done:
+        app.main(["train", "lead", "--out", str(tmp_path), "--seed", "3"])
+    said = capsys.readouterr().err
+    assert done.value.code == 2 and "result.json: expected a result of a search" in said
 
 
 class Vain(Lead):
