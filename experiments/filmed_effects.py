@@ -37,6 +37,8 @@ from torchdlo.vision.film import FilmLook
 EFFECTS = ("point_mass", "rest_curvature", "bending_damping", "air_drag", "table_friction")
 EXACT = 1e-6
 """Noise of markers that centre lines are drawn through [m]."""
+LARGE = 3
+"""Times its floor from which a gap of the calibrated rope is large."""
 
 
 def cases(seeds: int, nothing: int) -> list[Case]:
@@ -117,7 +119,14 @@ def table(rows: list[dict[str, Any]]) -> str:
     some, none = ([row for row in rows if bool(row["hidden"]) == wanted] for wanted in (True, False))
     said = {f"something hidden, {n} camera{'s' * (n > 1)}": [r for r in some if r["cameras"] == n] for n in (2, 1)}
     for what, each in said.items():
-        lines += [_rate(f"{what}: named", [set(r["hidden"]) <= {*r["named"], *r["or"]} for r in each])]
+        among = [set(r["hidden"]) <= {*r["named"], *r["or"]} for r in each]
+        lines += [_rate(f"{what}: named", among)]
+        large = [r["gap"]["test_rmse_before_m"] >= LARGE * r["gap"]["noise_floor_m"] for r in each]
+        lines += [
+            _rate(
+                f"{what}, gap of {LARGE} floors or more: named", [a for a, big in zip(among, large, strict=True) if big]
+            )
+        ]
         lines += [_rate(f"{what}: named, and nothing else", [r["right"] for r in each])]
     lines += [_rate("nothing hidden: nothing named", [not r["named"] for r in none])]
     lines += [_rate("nothing hidden: said to be explained", [r["right"] for r in none])]

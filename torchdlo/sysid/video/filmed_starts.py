@@ -177,8 +177,8 @@ def follow_starts(own: FilmedProblem, raw: np.ndarray) -> None:
         return
     fresh, window = own.picked(far), start_window(own)
     fresh.offset = np.zeros_like(fresh.offset)
-    for seconds in (window, 2 * window, None):
-        found = fit_starts(fresh, raw, 8, seconds=seconds)
+    for seconds, passes in ((0.5 * window, 3), (window, 8), (2 * window, 8), (None, 8)):
+        found = fit_starts(fresh, raw, passes, seconds=seconds)
     better = found < costs[far]
     own.offset = own.offset.copy()
     own.offset[far[better]] = fresh.offset[better]
