@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -167,21 +168,26 @@ def follow_starts(own: FilmedProblem, raw: np.ndarray) -> None:
     """Set the starts of the problem to the better ones of two ways there: from where they are, and from balance.
 
     Trials that are near their films do with the first. From balance starts are followed over more and more of the
-    time. Numbers (N,) stay as they are.
+    time, to its end where they are ahead by then. Numbers (N,) stay as they are.
     """
     if not own.offset.shape[1]:
         return
     costs = fit_starts(own, raw, 8)
-    far = np.flatnonzero(~own.start.at_rest & ~(costs < _SLIGHT))
-    if not len(far):
+    rows = np.flatnonzero(~own.start.at_rest & ~(costs < _SLIGHT))
+    if not len(rows):
         return
-    fresh, window = own.picked(far), start_window(own)
-    fresh.offset = np.zeros_like(fresh.offset)
-    for seconds, passes in ((0.5 * window, 3), (window, 8), (2 * window, 8), (None, 8)):
+    led, window = own.picked(rows), start_window(own)
+    fresh = replace(led, offset=np.zeros_like(led.offset))
+    for seconds, passes in ((0.5 * window, 3), (window, 8), (2 * window, 8)):
         found = fit_starts(fresh, raw, passes, seconds=seconds)
-    better = found < costs[far]
+    # What was fitted to these seconds alone and is no nearer there will not be over all of them.
+    ahead = found < look(led, raw, led.offset, 2 * window, worth=lambda costs: False).costs
+    if not ahead.any():
+        return
+    fresh, rows = fresh.picked(np.flatnonzero(ahead)), rows[ahead]
+    better = fit_starts(fresh, raw, 8) < costs[rows]
     own.offset = own.offset.copy()
-    own.offset[far[better]] = fresh.offset[better]
+    own.offset[rows[better]] = fresh.offset[better]
 
 
 def _standing_out(costs: np.ndarray) -> float:
