@@ -51,6 +51,7 @@ from torchdlo.sysid.video.filmed_problem import (
     without_rest,
 )
 from torchdlo.sysid.video.filmed_starts import START_WINDOW, fit_starts, refine_start, restart, scout, start_window
+from torchdlo.sysid.video.first_pictures import look_at_first_pictures
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import mask_overlaps, overlays
 from torchdlo.sysid.video.picture_gradient import descend, whitening, with_profile
@@ -179,7 +180,12 @@ def baseline(
     # Balances are cheap, and stiff ropes have shapes that do not depend on how stiff they are.
     starts = max(starts, FILMED_STARTS) if recording.still else starts
     first = np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))])
-    raw = own.space.to_raw(first) if given is not None else _scouted(own, starts, seed, report)
+    look_at_first_pictures(own, own.space.to_raw(first))
+    if given is not None:
+        raw = own.space.to_raw(first)
+        refine_start(own, first)
+    else:
+        raw = _scouted(own, starts, seed, report)
     best = _fitted(own, raw, iterations, report, near)
     first = np.concatenate([first[: len(own.free)], np.zeros(len(own.spines.nuisances.names))])
     if not np.isfinite(near):
@@ -245,8 +251,9 @@ def test_problem(
         unfitted_clocks(views, own.spines.views), own.model.dt, own.extent, own.spines.free, own.spines.sure
     )
     parts: dict[str, Any] = {"trials": tuple(trials), "motion": own.model.motion(trials), "spines": spines}
-    here = replace(own, **parts, dropped={}, misleading=(), discretisation_correction=None)
+    here = replace(own, **parts, dropped={}, misleading=(), discretisation_correction=None, shown=None)
     begin_from_balance(here, own.full(values[None])[0])
+    look_at_first_pictures(here, own.space.to_raw(values))
     if here.offset.shape[1]:
         coarse = here.with_options(substep=MAX_SUBSTEP)
         refine_start(coarse, values, search=True)
@@ -290,11 +297,7 @@ def _fitted(own: FilmedProblem, raw: np.ndarray, iterations: int, report: Callba
 
     One that is not `near` [m] the films over 70 % of the time stays as it is.
     """
-    stage, values = f"fitting {len(own.trials)} filmed trials", own.space.to_values(raw)
-    if own.offset.shape[1] and not own.offset.any():
-        # A scout knows the starts; a model that begins without one has to find them.
-        begin_from_balance(own, own.full(values[None])[0])
-        refine_start(own, values)
+    stage = f"fitting {len(own.trials)} filmed trials"
     best = fit(own, raw, 6, seconds=_MOST_OF * own.lasts, tolerance=_ROUGH)
     if own.model.mesh.clamps and "clamp_fraction" in own.options and not own.model.effects:
         # The rope may be held up to the last marker of a clamp, or bend between its markers.

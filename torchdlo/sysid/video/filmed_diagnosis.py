@@ -379,13 +379,13 @@ def _fitted(base: FilmedModel, score: Score, iterations: int, seconds: float) ->
 
 
 def _afresh(model: FilmedModel, seconds: float) -> list[FilmedModel]:
-    """Return a fit of trials in motion from ropes in balance, over more and more of the first seconds; none of others.
+    """Return a fit of trials in motion from fresh starts, over more and more of the first seconds; none of others.
 
     Starts of a baseline make up for what it lacks, and small steps from there may not lead back.
     """
     if not model.own.offset.shape[1]:
         return []
-    own, raw = replace(model.own, offset=np.zeros_like(model.own.offset)), model.fit.raw
+    own, raw = replace(model.own, offset=model.own.fresh), model.fit.raw
     correct(own, None)
     window = min(start_window(own), seconds)
     fit_starts(own, raw, 3, seconds=0.5 * window)

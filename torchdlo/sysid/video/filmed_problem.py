@@ -71,6 +71,8 @@ class FilmedProblem:
     of positions and velocities, shape (B, J); no columns where all trials begin at rest."""
     shapes: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     """Those smooth shapes at the places of the rope, of size one, shape (M, J / 6)."""
+    shown: Start | None = None
+    """Where trials in motion begin as their first pictures show it, if these were looked at."""
     sizes: dict[str, float] = field(default_factory=dict)
     """What counts as much of some numbers, in the terms of their scale."""
     steps_only: bool = False
@@ -114,6 +116,7 @@ class FilmedProblem:
         spines = Spines(views, self.model.dt, self.extent, self.spines.free, self.spines.sure)
         trials = tuple(self.trials[b] for b in rows)
         parts: dict[str, Any] = {"trials": trials, "motion": self.motion.pick(rows), "spines": spines}
+        parts["shown"] = None if self.shown is None else self.shown.pick(rows)
         return replace(self, **parts, start=self.start.pick(rows), offset=self.offset[rows], dropped={})
 
     def counting(self, good: Sequence[np.ndarray]) -> FilmedProblem:
@@ -225,10 +228,20 @@ class FilmedProblem:
         )
         pos, vel = (p.reshape(-1, *self.start.pos.shape[1:]) for p in parts)
         moving = np.tile(~self.start.at_rest, len(offsets))
+        pos[moving, :, 2] = np.maximum(pos[moving, :, 2], _lowest(self.model.recording))
         pos[moving] = self._laid(pos[moving])
         known = self.start.discretisation_correction
         more = None if known is None else np.tile(known, (len(offsets), 1, 1, 1))
         return Start(pos, vel, np.tile(self.start.at_rest, len(offsets)), more)
+
+    @property
+    def fresh(self) -> np.ndarray:
+        """Offsets (B, J) of starts that no fit has led astray: as first pictures show them, or of ropes in balance."""
+        if self.shown is None or not self.offset.shape[1]:
+            return np.zeros_like(self.offset)
+        ways = ((self.shown.pos, self.start.pos, _SHIFT), (self.shown.vel, self.start.vel, _DRIFT))
+        off = np.stack([(there - here) / size for there, here, size in ways], 1)
+        return np.einsum("jm,bkmc->bkjc", np.linalg.pinv(self.shapes), off).reshape(self.offset.shape)
 
     def _laid(self, pos: np.ndarray) -> np.ndarray:
         """Return places (N, M, 3) of ropes that are as long as they are, in the directions of given ones.
@@ -302,9 +315,9 @@ def _unchanged(view: FilmView, b: int) -> bool:
 
 def _placed(shape: np.ndarray, trial: Trial, recording: Recording) -> np.ndarray:
     """Return places (M, 3) of a rope that may lie on a table: a free end is laid out along its gripper's direction."""
-    if recording.table_height is None:
+    floor = _lowest(recording)
+    if not np.isfinite(floor):
         return shape
-    floor = recording.table_height + (recording.radius or 0.005)
     held = np.flatnonzero(trial.gripped)
     at, out = trial.marker_arclength, shape.copy()
     for last, inner, free in (
@@ -318,6 +331,11 @@ def _placed(shape: np.ndarray, trial: Trial, recording: Recording) -> np.ndarray
         out[free] = trial.markers[0, last] + np.abs(at[free] - at[last])[:, None] * way
     out[:, 2] = np.maximum(out[:, 2], floor)
     return out
+
+
+def _lowest(recording: Recording) -> float:
+    """Return the height of a rope that lies on the table [m]; -inf if there is none."""
+    return -np.inf if recording.table_height is None else recording.table_height + (recording.radius or 0.005)
 
 
 def filmed_problem(
@@ -356,7 +374,10 @@ def filmed_problem(
 
 
 def begin_from_balance(own: FilmedProblem, numbers: np.ndarray) -> None:
-    """Let trials in motion begin, until more is known, in balance with numbers (K,), carried along by the grippers."""
+    """Let trials in motion begin, until more is known, in balance with numbers (K,), carried along by the grippers.
+
+    Where first pictures show a rope elsewhere, it begins there, as something that is off from that balance.
+    """
     model, plain = own.model, start_of(own.model, own.trials, own.spines.views)
     spots = np.setdiff1d(np.arange(model.count), model.gripped)
     shapes = equilibrium.smooth_shapes(model.mesh, spots)
@@ -369,6 +390,7 @@ def begin_from_balance(own: FilmedProblem, numbers: np.ndarray) -> None:
     sound = np.isfinite(balance).all((1, 2))[:, None, None] & ~plain.at_rest[:, None, None]
     own.start = replace(plain, pos=np.where(sound, balance, plain.pos))
     own.offset = np.zeros((len(own.trials), 6 * own.shapes.shape[1]))
+    own.offset = own.fresh
 
 
 def add_correction(own: FilmedProblem, values: np.ndarray) -> None:

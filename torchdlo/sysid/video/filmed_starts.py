@@ -129,14 +129,18 @@ def refine_start(own: FilmedProblem, values: np.ndarray, passes: int = 8, *, sea
         own: the problem.
         values: numbers of rope and cameras.
         passes: most steps.
-        search: whether to look for better ones far away, too.
+        search: whether to look for better ones far away, too, of trials that stay far from their films.
     """
-    if own.offset.shape[1]:
-        raw = own.space.to_raw(values)
-        for share in (0.5, 1.0):
-            fit_starts(own, raw, passes, seconds=share * start_window(own))
-        if search:
-            search_starts(own, raw, passes, seconds=start_window(own))
+    if not own.offset.shape[1]:
+        return
+    raw = own.space.to_raw(values)
+    for share in (0.5, 1.0):
+        costs = fit_starts(own, raw, passes, seconds=share * start_window(own))
+    far = np.flatnonzero(~own.start.at_rest & ~(costs < _SLIGHT))
+    if search and len(far):
+        part = own.picked(far)
+        search_starts(part, raw, passes, seconds=start_window(own))
+        own.offset[far] = part.offset
 
 
 def restart(own: FilmedProblem, found: Fit, iterations: int, enough: float = _LOST) -> Fit:
@@ -165,10 +169,10 @@ def restart(own: FilmedProblem, found: Fit, iterations: int, enough: float = _LO
 
 
 def follow_starts(own: FilmedProblem, raw: np.ndarray) -> None:
-    """Set the starts of the problem to the better ones of two ways there: from where they are, and from balance.
+    """Set the starts of the problem to the better ones of two ways there: from where they are, and afresh.
 
-    Trials that are near their films do with the first. From balance starts are followed over more and more of the
-    time, to its end where they are ahead by then. Numbers (N,) stay as they are.
+    Trials that are near their films do with the first. Fresh starts are followed over more and more of the time, to its
+    end where they are ahead by then. Numbers (N,) stay as they are.
     """
     if not own.offset.shape[1]:
         return
@@ -177,9 +181,9 @@ def follow_starts(own: FilmedProblem, raw: np.ndarray) -> None:
     if not len(rows):
         return
     led, window = own.picked(rows), start_window(own)
-    fresh = replace(led, offset=np.zeros_like(led.offset))
-    for seconds, passes in ((0.5 * window, 3), (window, 8), (2 * window, 8)):
-        found = fit_starts(fresh, raw, passes, seconds=seconds)
+    fresh = replace(led, offset=led.fresh)
+    for seconds in (window, 2 * window):
+        found = fit_starts(fresh, raw, 8, seconds=seconds)
     # What was fitted to these seconds alone and is no nearer there will not be over all of them.
     ahead = found < look(led, raw, led.offset, 2 * window, worth=lambda costs: False).costs
     if not ahead.any():
@@ -215,7 +219,7 @@ def search_starts(own: FilmedProblem, raw: np.ndarray, passes: int = 8, *, secon
 
 
 def _places(own: FilmedProblem) -> np.ndarray:
-    """Return starts (P, B, J): those of the problem, and ropes in balance nearer and farther, coming and going.
+    """Return starts (P, B, J): those of the problem, and fresh ones nearer and farther, coming and going.
 
     These have none of the shapes with which a rope that was begun wrongly made up for that.
     """
@@ -226,7 +230,7 @@ def _places(own: FilmedProblem) -> np.ndarray:
             each = np.zeros((len(own.offset), 2, own.offset.shape[1] // 6, 3))
             # The first of the shapes is the whole rope's; the others follow.
             each[:, :, 0] = np.array([[place], [speed]]) * away
-            out.append(each.reshape(own.offset.shape))
+            out.append(own.fresh + each.reshape(own.offset.shape))
     return np.stack(out)
 
 

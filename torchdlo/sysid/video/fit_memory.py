@@ -66,7 +66,8 @@ def task(own: FilmedProblem, *asked: Any) -> tuple[Any, ...] | None:
     ]
     begun = start.pos, start.vel, start.at_rest, start.discretisation_correction, own.offset, own.shapes
     numbers = own.free, own.fixed, own.sizes
-    return asked, model.effects, own.options, numbers, own.motion.markers, begun, seen, spines.free, spines.sure
+    about = type(own).__name__, asked, model.effects, own.options, numbers, own.motion.markers
+    return *about, begun, seen, spines.free, spines.sure
 
 
 def recall(job: tuple[Any, ...] | None) -> Any:
