@@ -1,0 +1,89 @@
+"""Starts of ropes in motion as their first pictures show them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchdlo.sysid.estimation.observation import Spines, seen_by
+from torchdlo.sysid.recordings.recording import load_recording
+from torchdlo.sysid.video.filmed_problem import FilmedProblem, begin_from_balance, filmed_problem
+from torchdlo.sysid.video.first_pictures import look_at_first_pictures
+from torchdlo.sysid.video.footage import views_of
+
+DATA = Path(__file__).parents[2] / "torchdlo" / "data"
+
+
+@pytest.fixture(scope="module")
+def swing() -> FilmedProblem:
+    """The beginning of a film of a rope in motion."""
+    recording = load_recording(DATA / "sample_film")
+    views, _ = views_of(recording, recording.train[:1])
+    return filmed_problem(recording, recording.train[:1], views, options={"vertices": 13}).shortened(0.2)
+
+
+def raw_of(own: FilmedProblem) -> np.ndarray:
+    """Return coordinates of numbers as they are, and of cameras as written down."""
+    return own.space.to_raw(np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))]))
+
+
+def pixels(own: FilmedProblem, motion: np.ndarray) -> np.ndarray:
+    """Return where the camera sees motions (T, M, 3) by pictures, (F, M, 2)."""
+    sims = torch.as_tensor(motion[None, None]).float()
+    return seen_by(own.spines.views[0], sims, torch.zeros(1, 8), own.model.dt)[0][0, 0].numpy()
+
+
+def beside(points: np.ndarray, line: np.ndarray) -> float:
+    """Return the largest distance of points from the nearest place of a line [px]."""
+    fine = np.stack([np.interp(np.linspace(0, 1, 2000), np.linspace(0, 1, len(line)), x) for x in line.T], 1)
+    return float(np.linalg.norm(points[:, None] - fine, axis=-1).min(1).max())
+
+
+@pytest.mark.parametrize("side", [-5.0, 5.0])
+def test_a_rope_that_hangs_elsewhere_is_found_where_its_first_pictures_show_it(
+    swing: FilmedProblem, side: float
+) -> None:
+    across, own = np.array(swing.spines.views[0].camera.rotation)[0], replace(swing)
+    modes = np.zeros((1, 2, own.shapes.shape[1], 3))
+    modes[0, 0, 0], modes[0, 1, 0] = side * across, 2 * across
+    true = own.begin(modes.reshape(1, 1, -1))
+    times = own.model.dt * np.arange(own.motion.markers.shape[1])
+    motion = true.pos[0] + true.vel[0] * times[:, None, None]
+    seen = pixels(own, motion)
+    along = np.diff(seen, axis=1)
+    parts = {
+        "places": seen[None, :, :-1] + 0.5 * along,
+        "tangents": along[None] / np.linalg.norm(along[None], axis=-1)[..., None],
+    }
+    view = replace(own.spines.views[0], good=np.ones_like(own.spines.views[0].good), **parts)
+    own.spines = Spines([view], own.model.dt, own.extent, own.spines.free)
+    look_at_first_pictures(own, raw_of(own))
+    assert own.shown is not None
+    off, balance = (beside(pixels(own, pos)[0], seen[0]) for pos in (own.shown.pos, own.start.pos))
+    assert balance > 25 and off < 2
+
+
+def test_what_was_shown_is_kept_where_ropes_of_another_stiffness_are_in_balance(swing: FilmedProblem) -> None:
+    own = replace(swing)
+    look_at_first_pictures(own, raw_of(own))
+    assert own.shown is not None
+    own.fixed = own.fixed * np.array([20.0, 20.0, 1.0])
+    balance = own.start.pos
+    begin_from_balance(own, own.fixed)
+    assert np.abs(own.start.pos - balance).max() > 5e-3
+    there = own.begin(own.offset[None]).pos
+    assert np.abs(there - own.shown.pos).max() < 0.2 * np.abs(own.start.pos - own.shown.pos).max()
+
+
+def test_ropes_do_not_begin_below_the_table(swing: FilmedProblem) -> None:
+    lowest = float(swing.start.pos[..., 2].min())
+    recording = replace(swing.model.recording, table_height=lowest - 0.01)
+    own = filmed_problem(recording, swing.trials, swing.spines.views, options={"vertices": 13})
+    modes = np.zeros((1, 1, 2, own.shapes.shape[1], 3))
+    modes[..., 0, 0, 2] = -4.0
+    floor = lowest - 0.01 + recording.radius
+    assert own.begin(modes.reshape(1, 1, -1)).pos[..., 2].min() > floor - 2e-3
