@@ -77,7 +77,8 @@ def look_at(folder: Path, answers: Path, seed: int, page: Path) -> dict[str, Any
     told = findings(found, recording)
     used = {"cpu_s": time.process_time() - begun, "wall_s": time.perf_counter() - wall}
     report.write_report(found, recording, page)
-    true = json.loads((answers / f"{folder.name}.json").read_text())["answer"]
+    answer = json.loads((answers / f"{folder.name}.json").read_text())
+    true = answer["answer"]
     named = [e["name"] for e in told["effects"]]
     sets = [{e["name"], *e.get("indistinguishable_from", [])} for e in told["effects"]]
     right = all(any(t in each for each in sets) for t in true) and all(each & set(true) for each in sets)
@@ -86,6 +87,7 @@ def look_at(folder: Path, answers: Path, seed: int, page: Path) -> dict[str, Any
         "name": folder.name,
         "cameras": len(recording.train[0].films),
         "hidden": true,
+        "true": answer["effects"],
         "verdict": told["verdict"],
         "named": named,
         "or": as_well,
@@ -105,15 +107,18 @@ def kept(row: dict[str, Any]) -> dict[str, Any]:
 def table(rows: list[dict[str, Any]]) -> str:
     """Return rows as Markdown, and how often findings are right, with 90 % bounds by counting (Clopper-Pearson)."""
     lines = [
-        "| films | cameras | hidden | named | or | gap before, after [mm] | CPU s |",
-        "|---|---|---|---|---|---|---|",
+        "| films | cameras | hidden | verdict | named | or | gap on unseen films [mm] | floor | CPU s |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        gap = [1e3 * row["gap"][f"test_rmse_{when}_m"] for when in ("before", "after")]
-        words = [", ".join(row[k]) or "nothing" for k in ("hidden", "named")]
+        before, after, floor = (
+            1e3 * row["gap"][k] for k in ("test_rmse_before_m", "test_rmse_after_m", "noise_floor_m")
+        )
+        gap = f"{before:.2f} → {after:.2f}" if row["named"] else f"{before:.2f}"
+        hidden, named = _with_numbers(row["hidden"], row["true"]), _with_numbers(row["named"], row["effects"])
         lines.append(
-            f"| {row['name']} | {row['cameras']} | {words[0]} | {words[1]} | {', '.join(row['or'])} | "
-            f"{gap[0]:.2f}, {gap[1]:.2f} | {row['cpu_s']:.0f} |"
+            f"| {row['name'].removeprefix('single-')} | {row['cameras']} | {hidden or 'nothing'} | `{row['verdict']}` "
+            f"| {named} | {', '.join(row['or'])} | {gap} | {floor:.2f} | {row['cpu_s']:.0f} |"
         )
     lines.append("")
     some, none = ([row for row in rows if bool(row["hidden"]) == wanted] for wanted in (True, False))
@@ -131,6 +136,12 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines += [_rate("nothing hidden: nothing named", [not r["named"] for r in none])]
     lines += [_rate("nothing hidden: said to be explained", [r["right"] for r in none])]
     return "\n".join(lines)
+
+
+def _with_numbers(names: list[str], numbers: dict[str, dict[str, float]]) -> str:
+    """Return effects with their numbers, in SI units."""
+    said = ((name, ", ".join(f"{v:.3g}" for v in numbers.get(name, {}).values())) for name in names)
+    return "; ".join(f"{name.replace('_', ' ')} {each}".strip() for name, each in said)
 
 
 def _rate(what: str, right: list[bool]) -> str:

@@ -202,7 +202,7 @@ def _standing_out(costs: np.ndarray) -> float:
 def search_starts(own: FilmedProblem, raw: np.ndarray, passes: int = 8, *, seconds: float | None = None) -> np.ndarray:
     """Look for better starts far from those of the problem, which are set to the best; return their costs [m], (B,).
 
-    What a camera does not see is how far away the rope is and how fast it comes or goes: starts on either side are
+    What one camera does not see is how far away the rope is and how fast it comes or goes: starts on either side are
     followed for a while, then the better half of them, and each trial keeps its best. Numbers (N,) stay as they are.
     """
     trials = len(own.trials)
@@ -219,10 +219,12 @@ def search_starts(own: FilmedProblem, raw: np.ndarray, passes: int = 8, *, secon
 
 
 def _places(own: FilmedProblem) -> np.ndarray:
-    """Return starts (P, B, J): those of the problem, and fresh ones nearer and farther, coming and going.
+    """Return starts (P, B, J): those of the problem, and fresh ones; of one camera these nearer and farther, too.
 
     These have none of the shapes with which a rope that was begun wrongly made up for that.
     """
+    if len(own.spines.views) > 1:
+        return np.stack([own.offset, own.fresh])
     away = np.array(own.spines.views[0].camera.rotation)[2]
     out = [own.offset]
     for place in (-_NEARER, _NEARER):
