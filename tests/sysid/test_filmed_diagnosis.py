@@ -63,12 +63,12 @@ def test_fits_leave_models_and_starts_as_they_are(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(filmed_diagnosis, "fit", fitted)
     monkeypatch.setattr(filmed_diagnosis, "restart", lambda problem, found, *more: found)
-    model = FilmedModel(own, SimpleNamespace(raw=np.zeros(1)), test)
-    found = filmed_diagnosis._fitted_on(model, 3, 0.0)
+    model = FilmedModel(own, SimpleNamespace(raw=np.zeros(1), costs=np.array([1e-3])), test)
+    found = filmed_diagnosis._fitted_on(model, 3, 0.0, 1.4)
     found.test.offset = np.ones((1, 2))
     assert found.fit == "better" and found.own.offset.shape == (1, 3)
     assert own.offset.size == test.offset.size == 0 and model.own is own and model.test is test
-    alone = filmed_diagnosis._fitted_on(FilmedModel(own, model.fit, own), 3, None)
+    alone = filmed_diagnosis._fitted_on(FilmedModel(own, model.fit, own), 3, None, 1.4)
     assert alone.test is alone.own
 
 

@@ -273,7 +273,7 @@ def _round(
     more = plan.more * (_PATIENCE if base.own.trials[0].still else 1)
     # Starts that took up what the baseline lacked are not those of a model that has it.
     enough = _EXPLAINED * levenberg_marquardt.cost_of(level)
-    on = [*((fits[name], more, enough) for name in leading), (base, _COMPARED, None)]
+    on = [*((fits[name], more, enough, short) for name in leading), (base, _COMPARED, None, short)]
     rival = base
     for k, found in pool.map(_fitted_on, on):
         if k == len(leading):
@@ -374,8 +374,7 @@ def _fitted(base: FilmedModel, score: Score, iterations: int, seconds: float) ->
         read = start.own.spines.read(sims, values[:, len(start.own.free) :])
         costs.append(levenberg_marquardt.costs(read, target, start.own.extent)[0])
     best = starts[int(np.argmin(costs))]
-    near = replace(best, fit=fit(best.own, best.fit.raw, iterations, seconds=seconds, tolerance=_ROUGH))
-    return min((near, *_afresh(best, seconds)), key=lambda model: total(model.fit))
+    return replace(best, fit=fit(best.own, best.fit.raw, iterations, seconds=seconds, tolerance=_ROUGH))
 
 
 def _afresh(model: FilmedModel, seconds: float) -> list[FilmedModel]:
@@ -395,11 +394,17 @@ def _afresh(model: FilmedModel, seconds: float) -> list[FilmedModel]:
     return [replace(model, own=own, fit=look(own, raw, own.offset, seconds))]
 
 
-def _fitted_on(model: FilmedModel, iterations: int, enough: float | None) -> FilmedModel:
+def _fitted_on(model: FilmedModel, iterations: int, enough: float | None, seconds: float) -> FilmedModel:
     """Return a model with a better fit; the given one and its starts stay what they are.
 
-    Trials that cost more than `enough` [m] may begin elsewhere, none if it is not given.
+    Args:
+        model: that has been fitted to the first `seconds`.
+        iterations: most steps.
+        enough: what trials cost from which on they may begin elsewhere [m]; those of a baseline may not.
+        seconds: how much of the trials was fitted to.
     """
+    if enough is not None:
+        model = min((model, *_afresh(model, seconds)), key=lambda each: total(each.fit))
     own = replace(model.own)
     found = fit(own, model.fit.raw, iterations)
     if enough is not None:
