@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import statistics
 import sys
 import time
@@ -179,6 +180,14 @@ def _episodes(run: dict[str, Any]) -> int:
     return run["spent"]["result.json"]["episodes"]
 
 
+def _minutes(run: dict[str, Any]) -> float:
+    """Return the CPU minutes of a run, NaN where they were not kept."""
+    stages = run["spent"].get("stages.json")
+    if stages:
+        return sum(stages[s].get("cpu_seconds", math.nan) for s in ("robust", "clone", "tune") if s in stages) / 60
+    return run["spent"]["result.json"].get("cpu_seconds", math.nan) / 60
+
+
 def _row(task: str, algo: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
     from torchdlo.agents.rl.evaluate import wilson_interval
     from torchdlo.agents.rl.settings import PUBLISHED
@@ -196,6 +205,7 @@ def _row(task: str, algo: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
         "one_success": statistics.mean(r["one"]["success"] for r in runs),
         "one_return": statistics.mean(r["one"]["return"] for r in runs),
         "episodes": max(_episodes(r) for r in runs),
+        "minutes": max(_minutes(r) for r in runs),
         "published": PUBLISHED.get(task, {}).get(algo),
     }
 
@@ -204,8 +214,8 @@ def table(found: list[dict[str, Any]]) -> str:
     """Return rows as a table of Markdown."""
     lines = [
         "| task | algorithm | seeds | starts | success, unseen starts | 95 % | return | one start | return | episodes "
-        "| published |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "| CPU min | published |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for r in sorted(found, key=lambda r: (r["algorithm"], r["task"])):
         low, high = r["interval"]
@@ -218,7 +228,8 @@ def table(found: list[dict[str, Any]]) -> str:
             f"{r['success']:.0%}",
             f"{low:.0%} to {high:.0%}",
         ]
-        cells += [f"{r['return']:.2f}", f"{r['one_success']:.0%}", f"{r['one_return']:.2f}", str(r["episodes"]), known]
+        cells += [f"{r['return']:.2f}", f"{r['one_success']:.0%}", f"{r['one_return']:.2f}", str(r["episodes"])]
+        cells += ["" if math.isnan(r["minutes"]) else f"{r['minutes']:.0f}", known]
         lines.append(f"| {' | '.join(cells)} |")
     for algo in sorted({r["algorithm"] for r in found}):
         own = [r["success"] for r in found if r["algorithm"] == algo]

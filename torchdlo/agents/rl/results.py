@@ -98,6 +98,7 @@ def train_json(task: Task, settings: TrainingSettings, found: Trained) -> str:
         "fidelity": with_fidelity(task, settings.fidelity).fidelity.text,
         "episodes": found.episodes,
         "seconds": round(found.seconds, 1),
+        "cpu_seconds": round(found.cpu_seconds, 1),
         "best_batch": {"success": found.best[0], "return": found.best[1]} if found.rows else None,
         "interrupted": found.interrupted,
         "settings": asdict(settings),

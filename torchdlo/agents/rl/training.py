@@ -54,6 +54,8 @@ class Trained:
     """Share of successes and mean return of that batch."""
     episodes: int = 0
     seconds: float = 0.0
+    cpu_seconds: float = 0.0
+    """Of this process; what others play for it is not in."""
     rows: list[dict[str, Any]] = field(default_factory=list)
     """One entry per batch: episodes, seconds, return, success, failed, and what the algorithm says."""
     interrupted: bool = False
@@ -125,12 +127,13 @@ def _loop(
     writer = _writer(folder)
     last = time.monotonic()
     while done.episodes + episodes.count <= settings.episodes and done.seconds < 60 * settings.minutes:
-        began = time.monotonic()
+        began, busy = time.monotonic(), time.process_time()
         # What is judged is the policy that played, not the one that has learned from it.
         acting = copy.deepcopy(trainer.policy.state_dict())
         batch, told = trainer.iterate(episodes)
         done.episodes += episodes.count
         done.seconds += time.monotonic() - began
+        done.cpu_seconds += time.process_time() - busy
         row = _row(done, episodes, batch) | told
         done.rows.append(row)
         mark = (row["success"], row["return"])
@@ -198,6 +201,7 @@ def _write(
         "best": {"policy": done.policy.state_dict(), "mark": done.best},
         "episodes": done.episodes,
         "seconds": done.seconds,
+        "cpu_seconds": done.cpu_seconds,
         "rows": done.rows,
     }
     # Files of a GPU's run are read where there is none.
@@ -255,3 +259,4 @@ def _restore(
     done.policy.load_state_dict(content["best"]["policy"])
     done.best = tuple(content["best"]["mark"])
     done.episodes, done.seconds, done.rows = content["episodes"], content["seconds"], content["rows"]
+    done.cpu_seconds = content.get("cpu_seconds", 0.0)
