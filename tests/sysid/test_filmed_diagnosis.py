@@ -116,7 +116,7 @@ def test_a_rival_takes_the_starts_of_trials_that_it_fits_better_with(monkeypatch
     assert not own.offset.any() and other.offset.all()
 
 
-def test_effects_are_fitted_from_ropes_in_balance_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_effects_are_fitted_from_fresh_starts_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
     """Starts of a baseline make up for what it lacks: they are forgotten, and followed over longer and longer times."""
     none: Any = None
     own = FilmedProblem(none, (), none, none, none, (), np.zeros(0), {})

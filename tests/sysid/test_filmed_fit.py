@@ -15,7 +15,7 @@ from torchdlo.sysid.estimation.observation import INDEPENDENT, Spines, own_clock
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import load_recording
-from torchdlo.sysid.video import filmed, filmed_starts
+from torchdlo.sysid.video import filmed, filmed_model, filmed_starts
 from torchdlo.sysid.video.filmed import begun_elsewhere, doubts
 from torchdlo.sysid.video.filmed_fit import (
     Fit,
@@ -214,6 +214,28 @@ def test_starts_of_unseen_films_do_not_depend_on_where_they_were(swing: FilmedPr
         follow_starts(own, raw)
         costs.append(look(own, raw, own.offset, worth=lambda _: False).cost)
     assert max(costs) < 1.2 * min(costs) + 1e-5
+
+
+def test_an_unseen_film_that_a_simulation_does_not_last_for_is_not_explained(
+    swing: FilmedProblem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = swing.picked(np.zeros(2, int))
+    raw = own.space.to_raw(np.concatenate([[3e-3, 2e-3, 0.5], np.zeros(len(own.spines.nuisances.names))]))
+    sims = own.simulate(own.space.to_values(raw)[None])
+    for name in ("add_correction", "follow_starts", "time_films"):
+        monkeypatch.setattr(filmed_model, name, lambda *_: False)
+    for failed in (False, True):
+        sims[0, 1, 8:] = np.nan if failed else sims[0, 0, 8:]
+        monkeypatch.setattr(FilmedProblem, "simulate", lambda *_: sims)
+        gaps = filmed_model.FilmedModel(own, look(own, raw, own.offset, worth=lambda _: False), own).gaps("test")
+        assert np.isfinite(gaps[0]) and np.isinf(gaps[1]) == failed
+
+
+def test_cameras_that_begin_after_the_beginning_see_nothing_of_it(swing: FilmedProblem) -> None:
+    late = replace(swing.spines.views[0], camera=replace(swing.spines.views[0].camera, start=0.3))
+    both = replace(swing, spines=Spines([*swing.spines.views, late], swing.model.dt, swing.extent, swing.spines.free))
+    short = both.shortened(0.2)
+    assert not np.isfinite(short.spines.views[1].places).any() and np.isfinite(short.spines.views[0].places).any()
 
 
 def test_one_trial_whose_simulation_fails_does_not_stop_others(swing: FilmedProblem) -> None:

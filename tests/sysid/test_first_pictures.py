@@ -12,6 +12,7 @@ import torch
 from torchdlo.sysid.estimation.observation import Spines, seen_by
 from torchdlo.sysid.recordings.recording import load_recording
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, begin_from_balance, filmed_problem
+from torchdlo.sysid.video.filmed_starts import START_WINDOW, start_window
 from torchdlo.sysid.video.first_pictures import look_at_first_pictures
 from torchdlo.sysid.video.footage import views_of
 
@@ -62,8 +63,7 @@ def test_a_rope_that_hangs_elsewhere_is_found_where_its_first_pictures_show_it(
     view = replace(own.spines.views[0], good=np.ones_like(own.spines.views[0].good), **parts)
     own.spines = Spines([view], own.model.dt, own.extent, own.spines.free)
     look_at_first_pictures(own, raw_of(own))
-    assert own.shown is not None
-    off, balance = (beside(pixels(own, pos)[0], seen[0]) for pos in (own.shown.pos, own.start.pos))
+    off, balance = (beside(pixels(own, pos)[0], seen[0]) for pos in (own.begin(own.offset[None]).pos, own.start.pos))
     assert balance > 25 and off < 2
 
 
@@ -75,7 +75,7 @@ def test_what_was_shown_is_kept_where_ropes_of_another_stiffness_are_in_balance(
     balance = own.start.pos
     begin_from_balance(own, own.fixed)
     assert np.abs(own.start.pos - balance).max() > 5e-3
-    there = own.begin(own.offset[None]).pos
+    there = own.moved(own.offset[None]).pos
     assert np.abs(there - own.shown.pos).max() < 0.2 * np.abs(own.start.pos - own.shown.pos).max()
 
 
@@ -87,3 +87,48 @@ def test_ropes_do_not_begin_below_the_table(swing: FilmedProblem) -> None:
     modes[..., 0, 0, 2] = -4.0
     floor = lowest - 0.01 + recording.radius
     assert own.begin(modes.reshape(1, 1, -1)).pos[..., 2].min() > floor - 2e-3
+
+
+def two(swing: FilmedProblem) -> FilmedProblem:
+    """Return the problem of two trials that are alike."""
+    own = swing.picked(np.zeros(2, int))
+    own.trials = tuple(replace(t, name=f"train_{k}") for k, t in enumerate(own.trials))
+    return own
+
+
+def without(own: FilmedProblem, trial: int, seconds: float) -> FilmedProblem:
+    """Return the problem in which the first pictures of a trial do not count."""
+    good = [view.good.copy() for view in own.spines.views]
+    for each, view in zip(good, own.spines.views, strict=True):
+        each[trial, view.time[trial] < seconds] = False
+    return own.counting(good)
+
+
+def test_a_trial_that_is_seen_late_or_rests_leaves_others_as_they_are(swing: FilmedProblem) -> None:
+    alone = replace(swing)
+    look_at_first_pictures(alone, raw_of(alone))
+    late = without(two(swing), 1, 0.15)
+    resting = two(swing)
+    resting.start = replace(resting.start, still=np.array([False, True]))
+    for own in (late, resting):
+        look_at_first_pictures(own, raw_of(own))
+        np.testing.assert_allclose(own.offset[0], alone.offset[0], atol=1e-6)
+        assert not own.offset[1].any()
+
+
+def test_a_trial_whose_first_picture_is_wrong_begins_as_the_next_one_shows_it(swing: FilmedProblem) -> None:
+    own = without(two(swing), 1, 0.02)
+    look_at_first_pictures(own, raw_of(own))
+    one, other = own.begin(own.offset[None]).pos
+    assert own.offset[1].any() and np.abs(one - other).max() < 0.1
+    window = start_window(without(two(swing), 1, 0.15))
+    assert window > START_WINDOW + 0.2
+
+
+def test_fresh_starts_are_those_that_were_shown(swing: FilmedProblem) -> None:
+    own = two(swing)
+    own.offset = 2 * np.random.default_rng(0).normal(size=own.offset.shape)
+    moved = own.moved(own.offset[None])
+    own.shown = replace(own.start, pos=moved.pos, vel=moved.vel)
+    np.testing.assert_allclose(own.fresh, own.offset, atol=1e-9)
+    np.testing.assert_allclose(own.picked(np.array([1])).fresh[0], own.offset[1], atol=1e-9)

@@ -118,12 +118,17 @@ class FilmView:
     def shortened(self, seconds: float) -> FilmView:
         """Return what was seen in the first seconds."""
         inside = self.time <= seconds
-        count = int(inside.sum(1).max())
+        count = max(1, int(inside.sum(1).max()))
         good, places, tangents = self.good[:, :count], self.places[:, :count], self.tangents[:, :count]
         if not inside[:, :count].all():
             # Of cameras that began earlier than others what is too late has no centre line.
             places = np.where(inside[:, :count, None, None], places, np.nan)
         return replace(self, good=good, places=places, tangents=tangents)
+
+    @property
+    def first(self) -> np.ndarray:
+        """When the first pictures that count were taken [s], shape (B,); infinite where none was."""
+        return np.where(self.good, self.time, np.inf).min(1)
 
     @property
     def time(self) -> np.ndarray:

@@ -183,7 +183,7 @@ def baseline(
     look_at_first_pictures(own, own.space.to_raw(first))
     if given is not None:
         raw = own.space.to_raw(first)
-        refine_start(own, first)
+        refine_start(own, first, search=True)
     else:
         raw = _scouted(own, starts, seed, report)
     best = _fitted(own, raw, iterations, report, near)
@@ -434,6 +434,10 @@ def _judged(
     old, _ = picture_errors(other, first)
     new, pixels = picture_errors(here, values)
     sims = here.simulate(np.stack([first, values]))
+    for trial, sim in zip(here.trials, sims[1], strict=True):
+        if not (whole := np.isfinite(sim[: len(trial.time)]).all((1, 2))).all():
+            until = float(trial.time[int(whole.argmin())])
+            notes.append(f"{trial.name}: the simulation fails after {until:.2f} s; errors are of what came before.")
     share = mask_overlaps(here, sims[1], values[numbers:])
     trials = [
         {

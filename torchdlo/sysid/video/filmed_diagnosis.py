@@ -400,7 +400,8 @@ def _fitted_on(model: FilmedModel, iterations: int, enough: float | None, second
     Args:
         model: that has been fitted to the first `seconds`.
         iterations: most steps.
-        enough: what trials cost from which on they may begin elsewhere [m]; those of a baseline may not.
+        enough: what trials cost from which on they may begin elsewhere [m]. Not given for a baseline, whose starts stay
+            what they are; others are fitted from fresh starts, too, and the better fit goes on.
         seconds: how much of the trials was fitted to.
     """
     if enough is not None:

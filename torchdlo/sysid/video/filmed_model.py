@@ -13,7 +13,7 @@ from torchdlo.sysid.recordings.recording import Trial
 from torchdlo.sysid.video.filmed import test_problem
 from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, time_films
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, add_correction, first_frames
-from torchdlo.sysid.video.filmed_starts import follow_starts
+from torchdlo.sysid.video.filmed_starts import fit_starts, follow_starts
 
 __all__ = ["FilmedModel", "Films", "extended"]
 
@@ -36,18 +36,23 @@ class FilmedModel:
         return self.own.space.to_values(self.fit.raw)
 
     def gaps(self, split: str) -> np.ndarray:
-        """Return root mean squares of the readings of trials [m], shape (B,)."""
+        """Return root mean squares of the readings of trials [m], shape (B,); infinite where a simulation failed."""
         if split == "train":
             return film_gaps(self.own, self.fit)
         if self._tested is None:
             here = self.test
             # Neither starts nor what finer simulations change are those of another model.
             add_correction(here, self.values)
-            follow_starts(here, self.fit.raw)
+            if follow_starts(here, self.fit.raw):
+                add_correction(here, self.values)
+                fit_starts(here, self.fit.raw, 8)
             time_films(here, self.values)
             read = here.spines.read(here.simulate(self.values[None]), self.values[None, len(here.free) :])[0]
-            residual = np.where(np.isfinite(here.spines.target), read, np.nan)[:, :, : here.spines.priors.start, 0]
-            self._tested = np.sqrt(np.nanmean(residual**2, (1, 2)))
+            last = here.spines.priors.start
+            read, seen = read[:, :, :last, 0], np.isfinite(here.spines.target[:, :, :last, 0])
+            failed = (seen & ~np.isfinite(read)).any((1, 2))
+            gaps = np.sqrt(np.nanmean(np.where(seen, read, np.nan) ** 2, (1, 2)))
+            self._tested = np.where(failed, np.inf, gaps)
         return self._tested
 
 

@@ -72,7 +72,7 @@ class FilmedProblem:
     shapes: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     """Those smooth shapes at the places of the rope, of size one, shape (M, J / 6)."""
     shown: Start | None = None
-    """Where trials in motion begin as their first pictures show it, if these were looked at."""
+    """Where trials in motion begin as their first pictures show it, see `moved`, if these were looked at."""
     sizes: dict[str, float] = field(default_factory=dict)
     """What counts as much of some numbers, in the terms of their scale."""
     steps_only: bool = False
@@ -117,6 +117,8 @@ class FilmedProblem:
         trials = tuple(self.trials[b] for b in rows)
         parts: dict[str, Any] = {"trials": trials, "motion": self.motion.pick(rows), "spines": spines}
         parts["shown"] = None if self.shown is None else self.shown.pick(rows)
+        if (known := self.discretisation_correction) is not None:
+            parts["discretisation_correction"] = replace(known, step=known.step[rows], grid=known.grid[rows])
         return replace(self, **parts, start=self.start.pick(rows), offset=self.offset[rows], dropped={})
 
     def counting(self, good: Sequence[np.ndarray]) -> FilmedProblem:
@@ -221,18 +223,23 @@ class FilmedProblem:
 
     def begin(self, offsets: np.ndarray) -> Start:
         """Return starts for P B simulations with offsets (P, B, J); moved ropes are as long as they are."""
-        mode = offsets.reshape(*offsets.shape[:2], 2, -1, 3)
-        parts = (
-            x[None] + size * np.einsum("mj,pbjc->pbmc", self.shapes, mode[:, :, k])
-            for k, (x, size) in enumerate(((self.start.pos, _SHIFT), (self.start.vel, _DRIFT)))
-        )
-        pos, vel = (p.reshape(-1, *self.start.pos.shape[1:]) for p in parts)
-        moving = np.tile(~self.start.at_rest, len(offsets))
-        pos[moving, :, 2] = np.maximum(pos[moving, :, 2], _lowest(self.model.recording))
+        moved = self.moved(offsets)
+        pos, moving, free = moved.pos, ~moved.at_rest, self.spines.free
+        above = np.maximum(pos[..., 2], _lowest(self.model.recording))
+        pos[..., 2] = np.where(moving[:, None] & free, above, pos[..., 2])
         pos[moving] = self._laid(pos[moving])
         known = self.start.discretisation_correction
         more = None if known is None else np.tile(known, (len(offsets), 1, 1, 1))
-        return Start(pos, vel, np.tile(self.start.at_rest, len(offsets)), more)
+        return replace(moved, discretisation_correction=more)
+
+    def moved(self, offsets: np.ndarray) -> Start:
+        """Return starts with offsets (P, B, J) as they are: longer ropes, and some below the table."""
+        mode = offsets.reshape(*offsets.shape[:2], 2, -1, 3)
+        pos, vel = (
+            (x[None] + size * np.einsum("mj,pbjc->pbmc", self.shapes, mode[:, :, k])).reshape(-1, *x.shape[1:])
+            for k, (x, size) in enumerate(((self.start.pos, _SHIFT), (self.start.vel, _DRIFT)))
+        )
+        return Start(pos, vel, np.tile(self.start.at_rest, len(offsets)))
 
     @property
     def fresh(self) -> np.ndarray:

@@ -19,7 +19,7 @@ from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.video import fit_memory
 from torchdlo.sysid.video.filmed_fit import Fit, fit, look, total
-from torchdlo.sysid.video.filmed_problem import FilmedProblem, begin_from_balance
+from torchdlo.sysid.video.filmed_problem import FilmedProblem, begin_from_balance, correct
 
 __all__ = [
     "START_WINDOW",
@@ -60,9 +60,9 @@ _NEARER, _FASTER = 1.0, 2.0
 
 
 def start_window(own: FilmedProblem) -> float:
-    """Return the seconds of films that starts in motion are first estimated from: longer where films begin late."""
-    first = np.min([v.time[:, 0] for v in own.spines.views], 0).max()
-    return START_WINDOW + 2 * max(0.0, float(first) - own.model.dt)
+    """Return the seconds of films that starts in motion are first estimated from: longer where pictures begin late."""
+    first = np.min([v.first for v in own.spines.views], 0)
+    return START_WINDOW + 2 * max(0.0, float(first[np.isfinite(first)].max(initial=0.0)) - own.model.dt)
 
 
 def fit_starts(
@@ -168,30 +168,35 @@ def restart(own: FilmedProblem, found: Fit, iterations: int, enough: float = _LO
     return found
 
 
-def follow_starts(own: FilmedProblem, raw: np.ndarray) -> None:
+def follow_starts(own: FilmedProblem, raw: np.ndarray) -> bool:
     """Set the starts of the problem to the better ones of two ways there: from where they are, and afresh.
 
     Trials that are near their films do with the first. Fresh starts are followed over more and more of the time, to its
     end where they are ahead by then. Numbers (N,) stay as they are.
+
+    Returns:
+        Whether any begins elsewhere, which corrections do not know of.
     """
     if not own.offset.shape[1]:
-        return
+        return False
     costs = fit_starts(own, raw, 8)
     rows = np.flatnonzero(~own.start.at_rest & ~(costs < _SLIGHT))
     if not len(rows):
-        return
+        return False
     led, window = own.picked(rows), start_window(own)
     fresh = replace(led, offset=led.fresh)
+    correct(fresh, None)  # what is known of finer simulations is not of these
     for seconds in (window, 2 * window):
         found = fit_starts(fresh, raw, 8, seconds=seconds)
     # What was fitted to these seconds alone and is no nearer there will not be over all of them.
     ahead = found < look(led, raw, led.offset, 2 * window, worth=lambda costs: False).costs
     if not ahead.any():
-        return
+        return False
     fresh, rows = fresh.picked(np.flatnonzero(ahead)), rows[ahead]
     better = fit_starts(fresh, raw, 8) < costs[rows]
     own.offset = own.offset.copy()
     own.offset[rows[better]] = fresh.offset[better]
+    return bool(better.any())
 
 
 def _standing_out(costs: np.ndarray) -> float:
@@ -202,11 +207,11 @@ def _standing_out(costs: np.ndarray) -> float:
 def search_starts(own: FilmedProblem, raw: np.ndarray, passes: int = 8, *, seconds: float | None = None) -> np.ndarray:
     """Look for better starts far from those of the problem, which are set to the best; return their costs [m], (B,).
 
-    What one camera does not see is how far away the rope is and how fast it comes or goes: starts on either side are
-    followed for a while, then the better half of them, and each trial keeps its best. Numbers (N,) stay as they are.
+    What one camera does not see is how far away the rope is and how fast it comes or goes. Starts are followed for a
+    while, then the two best of them, and each trial keeps its best. Numbers (N,) stay as they are.
     """
     trials = len(own.trials)
-    offset = _places(own)
+    offset = _places(own, seconds)
     for keep, share in ((2, 0.6), (1, 1.0)):
         copies = own.picked(np.tile(np.arange(trials), len(offset)))
         copies.offset = offset.reshape(-1, offset.shape[-1])
@@ -218,15 +223,16 @@ def search_starts(own: FilmedProblem, raw: np.ndarray, passes: int = 8, *, secon
     return found[rows[0]]
 
 
-def _places(own: FilmedProblem) -> np.ndarray:
-    """Return starts (P, B, J): those of the problem, and fresh ones; of one camera these nearer and farther, too.
+def _places(own: FilmedProblem, seconds: float | None) -> np.ndarray:
+    """Return starts (P, B, J): those of the problem, fresh ones, ropes in balance, and others nearer and farther.
 
-    These have none of the shapes with which a rope that was begun wrongly made up for that.
+    The last are not needed where two cameras see each trial in time: they tell how far away it is. None of them has the
+    shapes with which a rope that was begun wrongly made up for that.
     """
-    if len(own.spines.views) > 1:
-        return np.stack([own.offset, own.fresh])
+    out = [own.offset, own.fresh, *([] if own.shown is None else [np.zeros_like(own.offset)])]
+    if (np.sum([v.first < (np.inf if seconds is None else seconds) for v in own.spines.views], 0) > 1).all():
+        return np.stack(out)
     away = np.array(own.spines.views[0].camera.rotation)[2]
-    out = [own.offset]
     for place in (-_NEARER, _NEARER):
         for speed in (-_FASTER, _FASTER):
             each = np.zeros((len(own.offset), 2, own.offset.shape[1] // 6, 3))

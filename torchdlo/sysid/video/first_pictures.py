@@ -27,52 +27,69 @@ _KEPT = 4
 _SPEEDS = 0.08
 """Seconds over which a rope goes on as it moves: a rope that falls freely is 31 mm elsewhere then."""
 
+_LATE = 0.1
+"""Seconds after which a first picture tells nothing of a start without a simulation."""
+
 
 class _Gliding(FilmedProblem):
     """A problem of ropes that go on as they move."""
 
     def simulate(self, values: np.ndarray, frames: int | None = None, offsets: np.ndarray | None = None) -> np.ndarray:
-        """Return places (P, B, T, M, 3); see `FilmedProblem.simulate`."""
+        """Return places (P, B, T, M, 3) for offsets (P, B, J); numbers do not matter."""
         start = self.begin(self.offset[None] if offsets is None else offsets)
         count = self.motion.markers.shape[1] if frames is None else frames
         pos, vel = (x.reshape(-1, len(self.trials), 1, *x.shape[1:]) for x in (start.pos, start.vel))
-        moved = pos + vel * (self.model.dt * np.arange(count))[:, None, None]
-        return np.repeat(moved, len(values), 0) if len(moved) == 1 else moved
+        return pos + vel * (self.model.dt * np.arange(count))[:, None, None]
 
 
 def look_at_first_pictures(own: FilmedProblem, raw: np.ndarray) -> None:
     """Let trials in motion begin as their first pictures show it, with cameras as numbers (N,) have them.
 
-    Where that is is kept: `FilmedProblem.shown`.
+    Where that is is kept, see `FilmedProblem.shown`. Trials whose first picture was taken late begin as before.
     """
     if not own.offset.shape[1]:
         return
-    first = max(float(v.time[b, v.good[b]][:1].sum()) for v in own.spines.views for b in range(len(own.trials)))
-    parts = {f.name: getattr(own, f.name) for f in fields(own)}
-    own.shown = None
-    short = _Gliding(**parts).shortened(first + _SPEEDS)
-    offset, trials = _swung(short), len(own.trials)
+    looked = ~own.start.at_rest & (np.min([view.first for view in own.spines.views], 0) <= _LATE)
+    if looked.any():
+        own.offset = own.offset.copy()
+        own.offset[looked] = _found(own.picked(np.flatnonzero(looked)), raw)
+    moved = own.moved(own.offset[None])
+    own.shown = Start(moved.pos, moved.vel, own.start.at_rest)
+
+
+def _found(own: FilmedProblem, raw: np.ndarray) -> np.ndarray:
+    """Return offsets of the starts of trials that are all in motion, (B, J)."""
+    firsts = np.array([view.first for view in own.spines.views])
+    until = firsts.min(0) + _SPEEDS
+    short = _Gliding(**{f.name: getattr(own, f.name) for f in fields(own)}).shortened(float(until.max()))
+    # Of each camera its first picture, if it takes one in time.
+    one = _up_to(short, np.where(firsts <= until, firsts, -np.inf).max(0) + 1e-6)
+    offset, trials = _swung(own.offset), len(own.trials)
     for passes, keep in ((4, _KEPT), (8, 1)):
-        copies = short.picked(np.tile(np.arange(trials), len(offset)))
+        copies = one.picked(np.tile(np.arange(trials), len(offset)))
         copies.offset = offset.reshape(-1, offset.shape[-1])
-        costs = fit_starts(copies, raw, passes, seconds=first + 1e-3).reshape(-1, trials)
+        costs = fit_starts(copies, raw, passes).reshape(-1, trials)
         rows = np.argsort(np.where(np.isfinite(costs), costs, np.inf), axis=0, kind="stable")[:keep]
         offset = copies.offset[rows * trials + np.arange(trials)]
-    short.offset = offset[0]
-    fit_starts(short, raw, 12)
-    own.offset = short.offset
-    found = short.begin(short.offset[None])
-    own.shown = Start(found.pos, found.vel, own.start.at_rest)
+    few = _up_to(short, until)
+    few.offset = offset[0]
+    fit_starts(few, raw, 12)
+    return few.offset
 
 
-def _swung(own: FilmedProblem) -> np.ndarray:
+def _up_to(own: FilmedProblem, last: np.ndarray) -> FilmedProblem:
+    """Return the problem in which pictures count up to a time of each trial (B,) [s]."""
+    return own.counting([view.good & (view.time <= last[:, None]) for view in own.spines.views])
+
+
+def _swung(offset: np.ndarray) -> np.ndarray:
     """Return offsets (P, B, J) of ropes as they begin, and swung to all sides."""
-    out = [own.offset]
+    out = [offset]
     for axis in range(3):
         for far in _SWUNG:
             for side in (-far, far):
-                each = own.offset.reshape(len(own.offset), 2, -1, 3).copy()
+                each = offset.reshape(len(offset), 2, -1, 3).copy()
                 # The first of the shapes is the whole rope's.
                 each[:, 0, 0, axis] += side
-                out.append(each.reshape(own.offset.shape))
+                out.append(each.reshape(offset.shape))
     return np.stack(out)
