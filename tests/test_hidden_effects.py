@@ -253,7 +253,10 @@ def test_doses_are_found_between_those_that_were_tried() -> None:
 
 
 def test_every_effect_has_a_dose_and_every_case_a_recording_of_its_own() -> None:
-    every = [*cases.all_cases(), *cases.subset("fresh")]
+    sealed = cases.subset("sealed")
+    assert len(sealed) == 60 and len({c.seed for c in sealed}) == 60
+    assert {len({c.simulator for c in sealed if c.effects == e}) for e in {c.effects for c in sealed[:16]}} == {2}
+    every = [*cases.all_cases(), *cases.subset("fresh"), *sealed]
     assert len({c.seed for c in cases.subset("fresh")} - {c.seed for c in cases.all_cases()}) == 27
     assert len({make.identity(c, "s") for c in every}) == len(every)
     for case in every:

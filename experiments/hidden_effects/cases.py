@@ -34,8 +34,9 @@ PARTS = (
     "links",
     "mismatch",
     "newer",
+    "sealed",
 )
-"""Parts of the benchmark; what is fresh, made of links, or differs only in how it is made is not in all."""
+"""Parts of the benchmark; what is fresh, sealed, made of links, or differs only in how it is made is not in all."""
 MISMATCH = (
     ("implicit", "links"),
     ("table", "links"),
@@ -293,6 +294,16 @@ def subset(name: str) -> list[Case]:
         return other_cases(1100, ("", "", "coloured", "table"), PAIRS[1::3], "links")
     if name == "newer":
         return [Case("single", (e,), r, 2200 + k) for r in (10.0, 30.0, 3.0) for k, e in enumerate(NEWER)]
+    if name == "sealed":
+        # Ropes and motions that no other part has, by both simulators in turns.
+        made, library = ("", "links"), [c.effects for c in all_cases() if c.kind == "single" and c.ratio == 10]
+        singles = [
+            Case("single", e, ratio, 5000 + 100 * j + k, "", made[(j + k) % 2])
+            for j, ratio in enumerate((10.0, 3.0, 30.0))
+            for k, e in enumerate(library)
+        ]
+        pairs = [Case("compound", p, 10.0, 5300 + k, "", made[k % 2]) for k, p in enumerate(PAIRS)]
+        return [*singles[:16], *pairs, *singles[16:]]
     if name == "mismatch":
         made = [(k, i, v, by) for i in range(REPEATS) for k, (v, by) in enumerate(MISMATCH)]
         return [Case("null", (), 0.0, 2000 + 10 * k + i, v, by) for k, i, v, by in made]
