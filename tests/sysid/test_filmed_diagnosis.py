@@ -64,11 +64,11 @@ def test_fits_leave_models_and_starts_as_they_are(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(filmed_diagnosis, "fit", fitted)
     monkeypatch.setattr(filmed_diagnosis, "restart", lambda problem, found, *more: found)
     model = FilmedModel(own, SimpleNamespace(raw=np.zeros(1), costs=np.array([1e-3])), test)
-    found = filmed_diagnosis._fitted_on(model, 3, 0.0, 1.4)
+    found = filmed_diagnosis._fitted_on(model, 3, 0.0)
     found.test.offset = np.ones((1, 2))
     assert found.fit == "better" and found.own.offset.shape == (1, 3)
     assert own.offset.size == test.offset.size == 0 and model.own is own and model.test is test
-    alone = filmed_diagnosis._fitted_on(FilmedModel(own, model.fit, own), 3, None, 1.4)
+    alone = filmed_diagnosis._fitted_on(FilmedModel(own, model.fit, own), 3, None)
     assert alone.test is alone.own
 
 
@@ -120,8 +120,8 @@ def test_effects_are_fitted_from_fresh_starts_as_well(monkeypatch: pytest.Monkey
     """Starts of a baseline make up for what it lacks: they are forgotten, and followed over longer and longer times."""
     none: Any = None
     own = FilmedProblem(none, (), none, none, none, (), np.zeros(0), {})
-    model = FilmedModel(own, SimpleNamespace(raw=np.zeros(1)), own)
-    assert filmed_diagnosis._afresh(model, 1.4) == []
+    model = FilmedModel(own, SimpleNamespace(raw=np.zeros(1), costs=np.array([2e-4])), own)
+    assert filmed_diagnosis._afresh(model, 1.4) is model
     own.offset, asked = np.ones((2, 6)), []
 
     def fitted(problem: FilmedProblem, raw: np.ndarray, *_: Any, seconds: float, **__: Any) -> Any:
@@ -134,9 +134,13 @@ def test_effects_are_fitted_from_fresh_starts_as_well(monkeypatch: pytest.Monkey
     monkeypatch.setattr(filmed_diagnosis, "start_window", lambda _: 0.4)
     monkeypatch.setattr(filmed_diagnosis, "fit_starts", fitted)
     monkeypatch.setattr(filmed_diagnosis, "fit", fitted)
-    monkeypatch.setattr(filmed_diagnosis, "look", lambda problem, raw, *_: SimpleNamespace(raw=raw, cost=1e-4))
+    monkeypatch.setattr(
+        filmed_diagnosis, "look", lambda problem, raw, *_: SimpleNamespace(raw=raw, costs=np.array([1e-4]))
+    )
     monkeypatch.setattr(FilmedProblem, "space", SimpleNamespace(to_values=lambda raw: raw))
-    (found,) = filmed_diagnosis._afresh(model, 1.4)
+    found = filmed_diagnosis._afresh(model, 1.4)
     assert [(offset, raw) for offset, raw, _ in asked] == [(0, 0), (0.5, 0), (1.0, 1), (1.5, 2)]
     np.testing.assert_allclose([seconds for *_, seconds in asked], [0.2, 0.4, 0.9, 1.4])
+    worse = FilmedModel(own, SimpleNamespace(raw=np.zeros(1), costs=np.array([0.5e-4])), own)
+    assert filmed_diagnosis._afresh(worse, 1.4) is worse
     assert found.fit.raw[0] == 3 and found.own.offset.max() == 2.0 and (own.offset == 1).all()

@@ -7,7 +7,7 @@ starts in motion take up what they can before an effect may explain it.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -268,12 +268,11 @@ def _round(
     for k, found in pool.map(_fitted, [(base, score, plan.iterations, short) for score in tried]):
         fits[tried[k].name] = found
         report(f"{stage}: fitting", len(fits), len(tried), f"{tried[k].name} {1e3 * found.fit.cost:.3f} mm")
-    order = sorted(fits, key=lambda n: fits[n].fit.cost)
-    leading = [n for n in order[:_LEADERS] if not fits[n].fit.cost > _BEHIND * fits[order[0]].fit.cost]
+    leading = _leading(fits, short, pool)
     more = plan.more * (_PATIENCE if base.own.trials[0].still else 1)
     # Starts that took up what the baseline lacked are not those of a model that has it.
     enough = _EXPLAINED * levenberg_marquardt.cost_of(level)
-    on = [*((fits[name], more, enough, short) for name in leading), (base, _COMPARED, None, short)]
+    on = [*((fits[name], more, enough) for name in leading), (base, _COMPARED, None)]
     rival = base
     for k, found in pool.map(_fitted_on, on):
         if k == len(leading):
@@ -377,13 +376,26 @@ def _fitted(base: FilmedModel, score: Score, iterations: int, seconds: float) ->
     return replace(best, fit=fit(best.own, best.fit.raw, iterations, seconds=seconds, tolerance=_ROUGH))
 
 
-def _afresh(model: FilmedModel, seconds: float) -> list[FilmedModel]:
-    """Return a fit of trials in motion from fresh starts, over more and more of the first seconds; none of others.
+def _leading(fits: dict[str, FilmedModel], seconds: float, pool: FitPool) -> list[str]:
+    """Return the effects whose fits to the first seconds are followed, from fresh starts where these fit better."""
+
+    def near(names: Iterable[str]) -> list[str]:
+        order = sorted(names, key=lambda n: fits[n].fit.cost)
+        return [n for n in order[:_LEADERS] if not fits[n].fit.cost > _BEHIND * fits[order[0]].fit.cost]
+
+    leading = near(fits)
+    for k, found in pool.map(_afresh, [(fits[name], seconds) for name in leading]):
+        fits[leading[k]] = found
+    return near(leading)
+
+
+def _afresh(model: FilmedModel, seconds: float) -> FilmedModel:
+    """Return a better fit of a model to the first seconds: from fresh starts, over more and more of them, or as it is.
 
     Starts of a baseline make up for what it lacks, and small steps from there may not lead back.
     """
     if not model.own.offset.shape[1]:
-        return []
+        return model
     own, raw = replace(model.own, offset=model.own.fresh), model.fit.raw
     correct(own, None)
     window = min(start_window(own), seconds)
@@ -391,21 +403,15 @@ def _afresh(model: FilmedModel, seconds: float) -> list[FilmedModel]:
     for until in (window, 0.5 * (window + seconds), seconds):
         raw = fit(own, raw, _AFRESH, seconds=until, tolerance=_ROUGH).raw
     add_correction(own, own.space.to_values(raw))
-    return [replace(model, own=own, fit=look(own, raw, own.offset, seconds))]
+    found = replace(model, own=own, fit=look(own, raw, own.offset, seconds))
+    return min(model, found, key=lambda each: total(each.fit))
 
 
-def _fitted_on(model: FilmedModel, iterations: int, enough: float | None, seconds: float) -> FilmedModel:
+def _fitted_on(model: FilmedModel, iterations: int, enough: float | None) -> FilmedModel:
     """Return a model with a better fit; the given one and its starts stay what they are.
 
-    Args:
-        model: that has been fitted to the first `seconds`.
-        iterations: most steps.
-        enough: what trials cost from which on they may begin elsewhere [m]. Not given for a baseline, whose starts stay
-            what they are; others are fitted from fresh starts, too, and the better fit goes on.
-        seconds: how much of the trials was fitted to.
+    Trials that cost more than `enough` [m] may begin elsewhere, none if it is not given.
     """
-    if enough is not None:
-        model = min((model, *_afresh(model, seconds)), key=lambda each: total(each.fit))
     own = replace(model.own)
     found = fit(own, model.fit.raw, iterations)
     if enough is not None:
