@@ -116,8 +116,10 @@ def table(rows: list[dict[str, Any]]) -> str:
         )
         gap = f"{before:.2f} → {after:.2f}" if row["named"] else f"{before:.2f}"
         hidden, named = _with_numbers(row["hidden"], row["true"]), _with_numbers(row["named"], row["effects"])
+        # A star is of an earlier version of the program.
+        name = row["name"].removeprefix("single-") + " *" * row.get("earlier", False)
         lines.append(
-            f"| {row['name'].removeprefix('single-')} | {row['cameras']} | {hidden or 'nothing'} | `{row['verdict']}` "
+            f"| {name} | {row['cameras']} | {hidden or 'nothing'} | `{row['verdict']}` "
             f"| {named} | {', '.join(row['or'])} | {gap} | {floor:.2f} | {row['cpu_s']:.0f} |"
         )
     lines.append("")
