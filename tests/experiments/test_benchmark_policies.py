@@ -25,7 +25,7 @@ def stored(folder: Path, success: float, seed: int) -> None:
     varied = {"episodes": 15, "success": success, "return": 60.0 + seed}
     found = {"task": "wiring_post", "algorithm": "ppo", "seed": seed, "varied": varied}
     (folder / "evaluation.json").write_text(json.dumps(found | {"one": {"success": 1.0, "return": 65.0}}))
-    (folder / "result.json").write_text(json.dumps({"episodes": 100 + seed}))
+    (folder / "result.json").write_text(json.dumps({"episodes": 100 + seed, "cpu_seconds": 600.0 * (1 + seed)}))
     (folder / "checkpoint.pt").write_text("large")
 
 
@@ -40,7 +40,7 @@ def test_rows_are_means_over_seeds_and_the_archive_has_no_checkpoints(script, tm
     # Wilson's interval of 21 in 30.
     assert row["interval"] == pytest.approx((0.5212, 0.8333), abs=1e-3)
     text = script.table([row])
-    assert "| wiring_post | ppo | 2 | 0 | 70% | 52% to 83% | 60.50 | 100% | 65.00 | 101 | 62.17, 67% |" in text
+    assert "| wiring_post | ppo | 2 | 0 | 70% | 52% to 83% | 60.50 | 100% | 65.00 | 101 | 20 | 62.17, 67% |" in text
     assert "ppo: mean success from unseen starts over 1 task 70%." in text
     assert file.stat().st_size < 2000
 
