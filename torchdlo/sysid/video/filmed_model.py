@@ -11,7 +11,7 @@ import numpy as np
 from torchdlo.sysid.estimation.observation import FilmView, Spines, unfitted_clocks
 from torchdlo.sysid.recordings.recording import Trial
 from torchdlo.sysid.video.filmed import test_problem
-from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, time_films
+from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, look, time_films
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, add_correction, first_frames
 from torchdlo.sysid.video.filmed_starts import fit_starts, follow_starts
 
@@ -47,12 +47,7 @@ class FilmedModel:
                 add_correction(here, self.values)
                 fit_starts(here, self.fit.raw, 8)
             time_films(here, self.values)
-            read = here.spines.read(here.simulate(self.values[None]), self.values[None, len(here.free) :])[0]
-            last = here.spines.priors.start
-            read, seen = read[:, :, :last, 0], np.isfinite(here.spines.target[:, :, :last, 0])
-            failed = (seen & ~np.isfinite(read)).any((1, 2))
-            gaps = np.sqrt(np.nanmean(np.where(seen, read, np.nan) ** 2, (1, 2)))
-            self._tested = np.where(failed, np.inf, gaps)
+            self._tested = film_gaps(here, look(here, self.fit.raw, here.offset, worth=lambda costs: False))
         return self._tested
 
 

@@ -12,7 +12,6 @@ from dataclasses import fields
 
 import numpy as np
 
-from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.video.filmed_problem import FilmedProblem
 from torchdlo.sysid.video.filmed_starts import fit_starts
 
@@ -53,8 +52,7 @@ def look_at_first_pictures(own: FilmedProblem, raw: np.ndarray) -> None:
     if looked.any():
         own.offset = own.offset.copy()
         own.offset[looked] = _found(own.picked(np.flatnonzero(looked)), raw)
-    moved = own.moved(own.offset[None])
-    own.shown = Start(moved.pos, moved.vel, own.start.at_rest)
+    own.shown = own.moved(own.offset[None])
 
 
 def _found(own: FilmedProblem, raw: np.ndarray) -> np.ndarray:
