@@ -27,6 +27,7 @@ _WRITTEN = (
     "result.json",
     "log.csv",
     "curve.png",
+    "report.html",
     "policy.pt",
     "checkpoint.pt",
     "robust.json",
@@ -62,8 +63,8 @@ def train(
         typer.Option(
             "--out",
             "-o",
-            help="Folder for policy.pt, log.csv, curve.png and what is needed to go on. Default: runs/train/TASK-ALGO, "
-            "and -SEED if that is not 0.",
+            help="Folder for policy.pt, report.html, log.csv, curve.png and what is needed to go on. Default: "
+            "runs/train/TASK-ALGO, and -SEED if that is not 0.",
             metavar="DIR",
         ),
     ] = None,
@@ -122,7 +123,7 @@ def train(
 
     quiet_torchrl()
     out = out or Path("runs") / "train" / f"{short_name(task)}-{algo}{f'-{seed}' if seed else ''}"
-    for name in ("result.json", "log.csv", "curve.png"):
+    for name in ("result.json", "log.csv", "curve.png", "report.html"):
         if not resume:
             check_writable(out / name, mark=b"torchdlo" if name != "log.csv" else b"episodes")
     given = {"episodes": episodes, "minutes": minutes, "seed": seed, "count": count, "fidelity": fidelity}
@@ -179,9 +180,10 @@ def _train(
     as_json: bool,
     address: str | None,
 ) -> None:
-    from torchdlo.agents.rl.results import prepare_training, train_json
+    from torchdlo.agents.rl.results import prepare_training, train_json, train_result
     from torchdlo.agents.rl.training import train as loop
     from torchdlo.report.figures.learning_curve import training_png
+    from torchdlo.report.pages.training_page import training_html
 
     trainer, played = prepare_training(task, settings, execution=execution, address=address)
     try:
@@ -193,9 +195,10 @@ def _train(
     write_atomically(out / "result.json", result)
     if found.rows:
         write_atomically(out / "curve.png", training_png({f"{task.name}, {settings.algorithm}": found.rows}))
+    write_atomically(out / "report.html", training_html(train_result(task, settings, found)))
     best = f"best batch: success {found.best[0]:.0%}, return {found.best[1]:.4g}" if found.rows else "nothing learned"
     typer.echo(f"{task.name}: {found.episodes} episodes, {best}", err=as_json)
-    typer.echo(f"policy: {out / 'policy.pt'}\nlog:    {out / 'log.csv'}\ncurve:  {out / 'curve.png'}", err=as_json)
+    typer.echo(f"policy: {out / 'policy.pt'}\nlog:    {out / 'log.csv'}\npage:   {out / 'report.html'}", err=as_json)
     if as_json:
         typer.echo(result, nl=False)
     if found.interrupted:
@@ -212,6 +215,7 @@ def _hybrid(
     as_json: bool,
 ) -> None:
     from torchdlo.agents.rl.hybrid_stages import STAGES, plan_of, train_hybrid
+    from torchdlo.report.pages.training_page import hybrid_html
 
     other = sorted(set(without) - set(STAGES))
     if other:
@@ -233,7 +237,8 @@ def _hybrid(
             ended = notes[name].get("ended")
             spent += f"; the budget of {ended} ended it" if ended else ""
             typer.echo(f"{name + ':':8}{spent}", err=as_json)
-    typer.echo(f"policy: {out / 'policy.pt'}", err=as_json)
+    write_atomically(out / "report.html", hybrid_html(notes, STAGES))
+    typer.echo(f"policy: {out / 'policy.pt'}\npage:   {out / 'report.html'}", err=as_json)
     if as_json:
         typer.echo(json.dumps(notes, indent=1))
 

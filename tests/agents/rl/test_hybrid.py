@@ -377,6 +377,7 @@ def test_commands_train_and_judge(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     result = json.loads(run(*words, "--episodes", "16", "--fidelity", "coarse", "--json"))
     assert (result["episodes"], result["fidelity"], len(result["curve"])) == (16, "1ms/2", 2)
     assert (out / "curve.png").read_bytes().startswith(b"\x89PNG")
+    assert "16 episodes" in (out / "report.html").read_text()
     run(*words, "--episodes", "24", "--fidelity", "coarse", "--resume")
     assert len((out / "log.csv").read_text().splitlines()) == 4
     assert load_policy(out).spec.task == "lead"
@@ -387,6 +388,8 @@ def test_commands_train_and_judge(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     words = ["train", "lead", "--out", str(tmp_path / "hybrid"), "--trajectory", str(found(tmp_path)), *small]
     notes = json.loads(run(*words, "--without", "tune", "--json"))
     assert "clone" in notes and "tune" not in notes
+    page = (tmp_path / "hybrid" / "report.html").read_text()
+    assert "<td>clone</td>" in page and "<td>tune</td>" not in page
     for wrong, said in (
         (["train", "lead", "--algo", "ppo", "--set", "rate"], "expected NAME=VALUE"),
         (["train", "lead", "--algo", "ppo", "--set", "speed=1"], "there is no speed"),

@@ -19,7 +19,7 @@ from torchdlo.envs import Task, with_fidelity
 from torchdlo.errors import InputError
 from torchdlo.physics.execution import Execution
 
-__all__ = ["evaluation_summary", "load_policies", "prepare_training", "train_json"]
+__all__ = ["evaluation_summary", "load_policies", "prepare_training", "train_json", "train_result"]
 
 
 def prepare_training(
@@ -89,9 +89,9 @@ def _scale(task: Task) -> float:
     return 10.0 / _RETURNS.get(task.name, 10.0)
 
 
-def train_json(task: Task, settings: TrainingSettings, found: Trained) -> str:
-    """Return what training came to as JSON."""
-    content = {
+def train_result(task: Task, settings: TrainingSettings, found: Trained) -> dict[str, Any]:
+    """Return what training came to as plain data."""
+    return {
         "generator": "torchdlo train",
         "task": task.name,
         "algorithm": settings.algorithm,
@@ -106,7 +106,11 @@ def train_json(task: Task, settings: TrainingSettings, found: Trained) -> str:
         "device": device_name(torch.device(settings.device)),
         "curve": found.rows,
     }
-    return json.dumps(content, indent=1) + "\n"
+
+
+def train_json(task: Task, settings: TrainingSettings, found: Trained) -> str:
+    """Return what training came to as JSON."""
+    return json.dumps(train_result(task, settings, found), indent=1) + "\n"
 
 
 def device_name(device: torch.device) -> str:
