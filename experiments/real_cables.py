@@ -2,6 +2,7 @@
 
     python experiments/real_cables.py RECORDING [RECORDING ...] --out runs/cables
     python experiments/real_cables.py RECORDING --plant time_delay tilted_gravity marker_offset point_mass
+    python experiments/real_cables.py --table runs/cables    # the tables of what is there, as Markdown
 
 RECORDING is a folder as `torchdlo import-deform` writes it. Without `--plant`, the cable is diagnosed as it is; errors
 are those published for the DEFORM cables (see `torchdlo.sysid.recordings.metrics`). `--blocks` makes the last
@@ -23,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from cable_table import table
 from options import Parser, count, save
 
 from torchdlo.cli.progress import progress
@@ -114,12 +116,12 @@ def diagnosed(recording: Recording, out: Path, plant: str, base: ModelFile | Non
     with progress() as callback:
         found = diagnose(recording, **choices, callback=callback, journal=out, resume=out.exists(), given=base)
     write_atomically(model, model_json(found))
-    save(str(kept), row(recording, found, plant, base))
+    save(str(kept), row(recording, out.name.removesuffix(f"-{plant}"), found, plant, base))
     shutil.rmtree(out)
     return json.loads(kept.read_text())
 
 
-def row(recording: Recording, found: Diagnosis, plant: str, base: ModelFile | None) -> dict:
+def row(recording: Recording, name: str, found: Diagnosis, plant: str, base: ModelFile | None) -> dict:
     """Return what a diagnosis found, for the table."""
     compared = [t for t, through in zip(recording.test, found.compared, strict=True) if through]
     errors = {
@@ -127,14 +129,17 @@ def row(recording: Recording, found: Diagnosis, plant: str, base: ModelFile | No
         for when, sims in found.predictions.items()
     }
     numbers = dict(zip(found.model.parameters, map(float, found.final.values), strict=True))
+    told = findings(found, recording)
     return {
-        "recording": recording.path.name,
+        "recording": name,
         "plant": plant,
         "verdict": found.verdict,
         "effects": found.effects,
         "ties": found.ties,
         "shares": found.shares,
-        "candidates": findings(found, recording)["candidates"],
+        "p_values": {e["name"]: e["test"] and e["test"]["p_value"] for e in told["effects"]},
+        "detection_limits": told["detection_limits"],
+        "candidates": told["candidates"],
         "test_mae_before_mm": errors["before"],
         "test_mae_after_mm": errors["after"],
         "test_trials": [len(compared), len(recording.test)],
@@ -146,6 +151,12 @@ def row(recording: Recording, found: Diagnosis, plant: str, base: ModelFile | No
         "named": not plant or any(plant in (e, *found.ties.get(e, [])) for e in found.effects),
         "seconds": found.seconds,
     }
+
+
+def stored(folder: Path) -> list[dict]:
+    """Return the rows of all recordings and plants in a folder of results."""
+    found = [json.loads(p.read_text()) for p in sorted(folder.glob("*.json")) if not p.stem.endswith("-model")]
+    return [row for row in found if isinstance(row, dict)]
 
 
 def show(rows: list[dict]) -> None:
@@ -168,7 +179,8 @@ def show(rows: list[dict]) -> None:
 def main() -> None:
     """Diagnose the recordings."""
     parser = Parser(__file__, description=__doc__)
-    parser.add_argument("recordings", nargs="+", type=Path, help="folders of recordings")
+    parser.add_argument("recordings", nargs="*", type=Path, help="folders of recordings")
+    parser.add_argument("--table", default="", help="folder of results whose tables are printed; nothing is run")
     parser.add_argument("--plant", nargs="*", choices=PLANTS, default=[], help="effects to plant, one at a time")
     parser.add_argument("--budget", choices=sorted(BUDGETS), default="full")
     parser.add_argument("--trials", type=count, default=None, help="most train trials to use")
@@ -178,6 +190,11 @@ def main() -> None:
     parser.add_argument("--out", default="runs/cables", help="folder of the results; what is in it is not done again")
     parser.flag("blocks", "test on the last fifth of the trials")
     args = parser.parse_args()
+    if args.table:
+        print(table(stored(Path(args.table))))
+        return
+    if not args.recordings:
+        parser.error("no recording is given; expected folders as `torchdlo import-deform` writes them, or --table")
     rows, choices = [], {k: getattr(args, k) for k in ("budget", "seed", "trials", "vertices", "workers")}
     for path in args.recordings:
         recording = load_recording(path)
