@@ -13,7 +13,9 @@ pytest.importorskip("kornia")
 
 from lead import Lead
 
+from torchdlo import envs
 from torchdlo.agents.policies import CloudPolicy, CloudSpec, load_policy
+from torchdlo.agents.policies.policy_files import save_policy
 from torchdlo.agents.rl.episodes import TaskEpisodes
 from torchdlo.agents.rl.student import DepthCamera, Student, _Eyes, cloud_spec, judge_student, teach
 from torchdlo.errors import InputError
@@ -53,6 +55,39 @@ def test_clouds_lie_on_the_rope_wherever_the_camera_is():
     exact = _Eyes(episodes, DepthCamera(noise=0.0, shift=0.0), torch.Generator().manual_seed(0))
     off = believed.see(episodes).mean(1) - exact.see(episodes).mean(1)
     assert float((off - believed.off[:, 0]).abs().max()) < 2e-3
+
+
+def test_clouds_show_the_surfaces_of_what_is_fixed_beside_the_rope():
+    task = envs.find("wiring_post")
+    episodes = TaskEpisodes(task, 2)
+    episodes.reset()
+    assert cloud_spec(task).fixtures and not cloud_spec(envs.find("unknotting")).fixtures
+    camera, random = DepthCamera(noise=0.0, size=256), torch.Generator().manual_seed(0)
+    cloud = _Eyes(episodes, camera, random, fixtures=True).see(episodes)
+    assert cloud.shape == (2, 384, 4)
+    state, sizes = episodes.env.world.state, episodes.env.episode.params.bodies.size
+    for b, (points, fixed) in enumerate(zip(cloud[..., :3], cloud[..., 3] == 1, strict=True)):
+        assert 0 < fixed.sum() <= 96
+        assert float(torch.cdist(points[~fixed], state.rods.pos[b]).amin(-1).max()) < 0.015
+        at = points[fixed][:, None] - state.bodies.pos[b]
+        radius, half = sizes.reshape(-1, len(at[0]), 3)[0, :, :2].unbind(-1)
+        # Posts are upright cylinders: beside or on top, a millimetre for how they are drawn.
+        beside, above = at[..., :2].norm(dim=-1) - radius, at[..., 2].abs() - half
+        assert float(torch.maximum(beside, above).abs().amin(-1).max()) < 1e-3
+
+
+def test_a_policy_that_sees_fixtures_tells_them_from_the_rope(tmp_path: Path):
+    policy = CloudPolicy(CloudSpec((0.0, 0.0, 0.0), ((0.1, 0.0, 0.0),), fixtures=True))
+    cloud, tool, share = torch.randn(2, 20, 4), torch.randn(2, 1, 3), torch.rand(2, 1)
+    other = torch.cat([cloud[..., :3], 1 - cloud[..., 3:]], -1)
+    one = policy(cloud, tool, tool, share)
+    assert not torch.allclose(one, policy(other, tool, tool, share), atol=1e-6)
+    save_policy(policy, tmp_path / "policy.pt")
+    assert torch.equal(load_policy(tmp_path)(cloud, tool, tool, share), one)
+    # Files from before clouds had fixtures do not say that they have.
+    plain = policy.spec.plain()
+    del plain["fixtures"]
+    assert not CloudSpec.of(plain).fixtures
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Policies that see a rope as a cloud of points, as a depth camera reports it, and know where their tools are.
+"""Policies that see rope and fixtures as points, as a depth camera reports them, and know where their tools are.
 
 Each point goes through the same small network; the largest and the mean of what it says are what is known of the cloud
 (PointNet: Qi et al. 2017, arXiv:1612.00593; Deep Sets: Zaheer et al. 2017, arXiv:1703.06114), whatever the order of its
@@ -40,6 +40,8 @@ class CloudSpec:
     task: str = ""
     reach: float = 0.01
     """Greatest way of a tool [m], one unit of an action."""
+    fixtures: bool = False
+    """Whether clouds have points of fixtures, and a fourth number that tells them from those of the rope."""
 
     @property
     def actions(self) -> int:
@@ -69,7 +71,7 @@ class CloudPolicy(nn.Module):
         super().__init__()
         self.spec = spec
         arms = len(spec.tools)
-        sizes = (3 * (1 + arms), *spec.points)
+        sizes = (3 * (1 + arms) + spec.fixtures, *spec.points)
         layers = [(nn.Linear(a, b), nn.SiLU()) for a, b in itertools.pairwise(sizes)]
         self.point = nn.Sequential(*itertools.chain(*layers))
         width = 2 * sizes[-1] + 6 * arms + 1 + 2 * spec.waves
@@ -82,13 +84,15 @@ class CloudPolicy(nn.Module):
         """Return actions, shape (N, A).
 
         Args:
-            cloud: points of the rope [m], shape (N, P, 3).
+            cloud: points [m], shape (N, P, 3); of policies that see fixtures (N, P, 4), the last number being 1 for
+                points of these and 0 for those of the rope.
             tool: where tools are [m], shape (N, R, 3).
             start: where they were at the start [m], shape (N, R, 3).
             progress: share of the episode that is over, shape (N, 1).
         """
-        relative = [cloud - self._center, *(cloud - tool[:, k : k + 1] for k in range(tool.shape[1]))]
-        each = self.point(torch.cat(relative, -1) / _UNIT)
+        at, kind = cloud[..., :3], cloud[..., 3:]
+        relative = [at - self._center, *(at - tool[:, k : k + 1] for k in range(tool.shape[1]))]
+        each = self.point(torch.cat([*(x / _UNIT for x in relative), kind], -1))
         known = [each.amax(1), each.mean(1)]
         known += [((x - self._tools) / _UNIT).flatten(1) for x in (tool, start)]
         angle = progress * self._wave

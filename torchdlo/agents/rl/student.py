@@ -1,7 +1,7 @@
 """Students: policies that see clouds of points learn what a policy that sees the state would do (DAgger).
 
 The student plays, and its teacher, who knows where every vertex is, says what it would have done. What the student sees
-has noise of depth, and the camera stands elsewhere in each episode.
+of rope and fixtures has noise of depth, and the camera stands elsewhere in each episode.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -28,8 +28,12 @@ from torchdlo.agents.torch_records import load_checkpoint, save_checkpoint, tens
 from torchdlo.envs import PUBLISHED, Task, with_fidelity
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
+from torchdlo.physics import tree
 from torchdlo.vision.camera import Lens
-from torchdlo.vision.point_cloud import POINTS, point_cloud
+from torchdlo.vision.point_cloud import POINTS, point_cloud, scene_cloud
+
+if TYPE_CHECKING:
+    from torchdlo.vision.renderer import Pinhole
 
 __all__ = ["CONDITIONS", "DepthCamera", "Student", "cloud_spec", "judge_student", "teach"]
 
@@ -92,9 +96,11 @@ class Student:
 class _Eyes:
     """The cameras of a batch of episodes: in front of the arms, each a little off its place."""
 
-    def __init__(self, episodes: TaskEpisodes, camera: DepthCamera, generator: torch.Generator) -> None:
+    def __init__(
+        self, episodes: TaskEpisodes, camera: DepthCamera, generator: torch.Generator, *, fixtures: bool = False
+    ) -> None:
         from torchdlo.envs.observations.pixels import cameras_of
-        from torchdlo.vision.renderer import intrinsics, looking_at
+        from torchdlo.vision.renderer import Pinhole, intrinsics, looking_at
 
         front = cameras_of(episodes.env.episode)[0]
         self.camera, self.generator, size = camera, generator, (camera.size, camera.size)
@@ -106,23 +112,48 @@ class _Eyes:
         translation = torch.stack([v.translation for v in views]).double()
         self.lens = Lens(matrix, matrix.new_zeros(len(views), 5), rotation, translation)
         self.off = camera.error * torch.randn(episodes.count, 1, 3, generator=generator, dtype=torch.float64)
+        self.fixtures = fixture_depths(episodes, Pinhole(matrix, rotation, translation), size) if fixtures else None
+        """Depths at which pixels show fixtures [m], (N, H, W): neither they nor cameras move in an episode."""
 
     def see(self, episodes: TaskEpisodes) -> Tensor:
-        """Return clouds [m], shape (N, P, 3)."""
-        x, size = episodes.env.world.state.rods.pos.double(), (self.camera.size,) * 2
+        """Return clouds [m], shape (N, P, 3), with fixtures (N, P, 4), see `CloudPolicy.forward`."""
+        x, size = torch.nan_to_num(episodes.env.world.state.rods.pos.double()), (self.camera.size,) * 2
         choices: dict[str, Any] = {"count": self.camera.count, "noise": self.camera.noise, "generator": self.generator}
         # Where the camera is believed to be moves all points with it.
-        return (point_cloud(self.lens, torch.nan_to_num(x), size, **choices)[0] + self.off).float()
+        if self.fixtures is None:
+            return (point_cloud(self.lens, x, size, **choices)[0] + self.off).float()
+        points, fixed = scene_cloud(self.lens, x, self.fixtures, **choices)
+        return torch.cat([points + self.off, fixed[..., None]], -1).float()
+
+
+def fixture_depths(episodes: TaskEpisodes, view: Pinhole, size: tuple[int, int]) -> Tensor:
+    """Return the depths at which cameras (N,) see bodies that are fixed [m], infinite elsewhere, shape (N, H, W)."""
+    from torchdlo.vision.renderer import BODY, RenderModel, render
+    from torchdlo.vision.scene_geometry import model_of, placement_of
+
+    made, state = episodes.env.episode, episodes.env.world.state
+    fixed = {BODY + k for k, body in enumerate(made.scene.bodies) if body.motion == "fixed"}
+    pieces = tuple(p for p in model_of(made.scene, made.params).pieces if p.id in fixed)
+    placement = placement_of(state)
+    placement = replace(placement, ropes=placement.ropes[:, :0], particles=placement.particles[:, :0])
+    parts = ("intrinsics", "rotation", "translation")
+    each = replace(view, **{n: getattr(view, n)[:, None] for n in parts})
+    asked: dict[str, Any] = {"samples": 1, "shadow": 0, "rgb": False, "depth": True, "ids": True}
+    seen = render(RenderModel(pieces), placement, each, (size[1], size[0]), **asked)
+    depth, ids = (tree.part(x)[:, 0] for x in (seen.depth, seen.ids))
+    return torch.where(ids >= BODY, depth, torch.inf).double()
 
 
 def cloud_spec(task: Task) -> CloudSpec:
     """Return what a policy of clouds for a task is."""
     from torchdlo.envs.core import episode
 
-    start = episode.prepare(task, 1, execution="eager").start
+    made = episode.prepare(task, 1, execution="eager")
+    start = made.start
     center = tuple(start.state.rods.pos[0].mean(0).tolist())
     tools = tuple(tuple(p) for p in start.tool.pos[0].tolist())
-    return CloudSpec(center, tools, task=task.name, reach=task.max_translation)
+    fixtures = any(body.motion == "fixed" and body.shape != "plane" for body in made.scene.bodies)
+    return CloudSpec(center, tools, task=task.name, reach=task.max_translation, fixtures=fixtures)
 
 
 @dataclass(eq=False)
@@ -195,6 +226,7 @@ def _check_same(part: Path, kept: dict[str, Any], now: dict[str, Any]) -> None:
     """Refuse what belongs to another task, teacher or plan; those of 0.1 did not say."""
     was = json.loads(kept.get("belongs", "{}"))
     other = changed(was, {"task": now["task"]}) + changed(was.get("plan", {}), now["plan"])
+    other += ["clouds without fixtures"] if now["fixtures"] and not was.get("fixtures") else []
     other += ["another teacher"] if changed(was, {"teacher": now["teacher"]}) else []
     if other:
         said = f"it belongs to a run with {', '.join(other)}; give the same, or leave out --resume"
@@ -225,7 +257,8 @@ def teach(
         torch.manual_seed(plan.seed)
         student, memory, log = CloudPolicy(cloud_spec(task)), _Memory(), []
         part, spent = folder / "student.part", 0.0
-        belongs = {"plan": asdict(plan), "teacher": _teacher_hash(teacher), "task": task.name}
+        belongs: dict[str, Any] = {"plan": asdict(plan), "teacher": _teacher_hash(teacher), "task": task.name}
+        belongs |= {"fixtures": student.spec.fixtures}
         kept = load_checkpoint(part) if resume else None
         if kept is not None:
             _check_same(part, kept, belongs)
@@ -241,7 +274,7 @@ def teach(
             fine = with_fidelity(task, "coarse" if how == "coarse" else PUBLISHED)
             episodes = TaskEpisodes(fine, plan.count, seed=plan.seed + 21 + k)
             episodes.reset()
-            eyes = _Eyes(episodes, plan.camera, rng)
+            eyes = _Eyes(episodes, plan.camera, rng, fixtures=student.spec.fixtures)
             choices: dict[str, Any] = {"driven": k == 0, "noise": plan.noise, "memory": memory}
             good, failed = _play(student, teacher, episodes, eyes, **choices)
             error = _fit(student, memory, plan, plan.updates * (2 if k + 1 == len(rounds) else 1))
@@ -285,7 +318,8 @@ def judge_student(
     for n, name in enumerate(conditions):
         episodes = TaskEpisodes(fine, starts)
         episodes.begin(drawn)
-        eyes = _Eyes(episodes, CONDITIONS[name], torch.Generator().manual_seed(UNSEEN + 1000 * seed + 1))
+        random = torch.Generator().manual_seed(UNSEEN + 1000 * seed + 1)
+        eyes = _Eyes(episodes, CONDITIONS[name], random, fixtures=student.spec.fixtures)
 
         def told(k: int, before: int = n * fine.horizon, name: str = name) -> None:
             if callback is not None:
