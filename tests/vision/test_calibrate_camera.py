@@ -17,14 +17,14 @@ MATRIX = np.array([[520.0, 0, 310], [0, 525.0, 235], [0, 0, 1]])
 BOARDS = [Board(8, 6, 0.03), Board(8, 6, 0.03, 0.022)]
 
 
-def filmed(board: Board, path: Path, frames: int = 14) -> None:
-    """A film of the board, turned this way and that."""
+def filmed(board: Board, path: Path, frames: int = 14, tilt: float = 0.45) -> None:
+    """A film of the board, turned this way and that by up to `tilt` about each axis [rad]."""
     rng = np.random.default_rng(0)
     flat = board_picture(board, 80)
     pictures = []
     for k in range(frames):
         turn = cv2.Rodrigues(np.array([np.pi, 0, 0]))[0]  # its z axis towards the camera
-        turn = cv2.Rodrigues(rng.uniform(-0.45, 0.45, 3) * (k > 0))[0] @ turn
+        turn = cv2.Rodrigues(rng.uniform(-tilt, tilt, 3) * (k > 0))[0] @ turn
         centre = np.array([0.03 * 4, -0.03 * 3, 0.0])
         shift = np.array([*rng.uniform(-0.06, 0.06, 2), 0.42 + 0.1 * rng.random()]) - turn @ centre
         # A pixel of the board's picture is a place on the board: its first inner corner is the origin.
@@ -50,6 +50,20 @@ def test_a_known_camera_is_found_again(board: Board, tmp_path: Path) -> None:
     assert error_picture(found).startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize("frames", [6, 14])
+def test_a_board_that_is_only_moved_tells_no_focal_length(frames: int, tmp_path: Path) -> None:
+    filmed(BOARDS[0], tmp_path / "board.mp4", frames, tilt=0.01)
+    with pytest.raises(InputError, match="tilted to several sides, found one from which no focal length follows"):
+        calibrate_camera(tmp_path / "board.mp4", BOARDS[0])
+
+
+def test_a_board_that_is_tilted_little_tells_how_uncertain_the_focal_length_is(tmp_path: Path) -> None:
+    filmed(BOARDS[0], tmp_path / "board.mp4", 6, tilt=0.2)
+    found = calibrate_camera(tmp_path / "board.mp4", BOARDS[0])
+    assert abs(found.camera.fx / 520 - 1) < 0.05
+    assert any("The focal length is uncertain by 2%" in note for note in found.notes)
+
+
 def test_a_film_without_a_board_is_refused(tmp_path: Path) -> None:
     write_video(tmp_path / "grey.mp4", np.full((10, 120, 160), 128, np.uint8), 30.0)
     with pytest.raises(InputError, match="found it in 0 of 10"):
@@ -60,6 +74,7 @@ def test_a_film_without_a_board_is_refused(tmp_path: Path) -> None:
     ("given", "message"),
     [
         ({"square": float("inf")}, "square: expected"),
+        ({"square": 25.0}, "in m, such as 0.025, found 25"),
         ({"square": 0.025, "marker": 0.03}, "smaller than a square's"),
         ({"columns": 40, "rows": 40, "marker": 0.02}, "at most 50 markers"),
         ({"marker": 0.02, "dictionary": "CORNER_REFINE_NONE"}, "a name that OpenCV knows"),

@@ -114,6 +114,16 @@ def test_wrong_frames_are_left_out(plain: Film, kind: str, spoil) -> None:
     assert "frame 5" in issues[0].text
 
 
+@pytest.mark.parametrize("at", [(5,), (5, 6)])
+def test_repeats_that_a_codec_has_changed_are_left_out(plain: Film, at: tuple[int, ...]) -> None:
+    masks, rng = plain.masks.copy(), np.random.default_rng(0)
+    for k in at:
+        masks[k] = masks[k - 1]
+        edge = np.argwhere(masks[k] & ~np.roll(masks[k], 1, 0))
+        masks[k][tuple(rng.permutation(edge)[:7].T)] = False
+    assert tuple(np.flatnonzero(~check_masks(masks, "film")[0])) == at
+
+
 @pytest.mark.parametrize("coloured", [False, True])
 def test_repeats_of_a_rope_that_swings_are_left_out_while_its_grippers_rest(plain: Film, coloured: bool) -> None:
     masks, pictures, resting = plain.masks.copy(), plain.pictures.copy(), np.zeros(len(plain.masks), bool)

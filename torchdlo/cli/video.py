@@ -64,6 +64,8 @@ def calibrate_camera(
     if print_board is not None:
         import cv2
 
+        if print_board.suffix.lower() != ".png":
+            raise InputError(f"--print-board: expected a name that ends in .png, found {print_board}.")
         check_writable(print_board, mark=b"PNG")
         done, data = cv2.imencode(".png", calibration.board_picture(printed))
         write_atomically(print_board, data.tobytes() if done else b"")
@@ -148,7 +150,8 @@ def segment(
         check_writable(masks)
     pictures, _ = work.load_film(video)
     if pictures.dtype == bool:
-        raise InputError(f"{video}: expected a film in colour, found masks; they are used as they are.")
+        what = "masks; they are used as they are" if pictures.any() else "black pictures only; film it again"
+        raise InputError(f"{video}: expected a film in colour, found {what}.")
     chosen = work.load_ranges(ranges) if ranges is not None else work.ranges_of(_rgb(color)) if color else None
     served = background is None and chosen is None
     found: np.ndarray | None = None

@@ -29,6 +29,21 @@ _CORNERS = 6
 """Corners that a picture needs."""
 
 
+_LARGEST = 1.0
+"""Side of a square from which it is not in metres [m]."""
+
+_TILTED = 3.0
+"""How far boards have to be turned against each other for the focal length to be known [degrees]: boards that are all
+seen from the same side look alike to a longer lens farther away."""
+
+_NARROW, _WIDE = 3.0, 150.0
+"""Angles of view along a picture that no camera of ropes has [degrees]: where the focal length is not known."""
+
+_KNOWN, _UNKNOWN = 0.01, 0.1
+"""Standard deviation of the focal length, as a share, that fits to films take it to have, and from which it is not
+known."""
+
+
 @dataclass(frozen=True)
 class Board:
     """A printed board."""
@@ -47,6 +62,8 @@ class Board:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.square) and self.square > 0):
             raise InputError(f"square: expected the side of a square in m, found {self.square:g}.")
+        if self.square > _LARGEST:
+            raise InputError(f"square: expected the side of a square in m, such as 0.025, found {self.square:g}.")
         if self.marker is not None and not 0 < self.marker < self.square:
             raise InputError(
                 f"marker: expected the side of a marker in m, smaller than a square's of {self.square:g}, found "
@@ -119,12 +136,17 @@ def calibrate_camera(
     objects = [model[at].astype(np.float32)[:, None] for _, at, _ in seen]
     images = [corners.astype(np.float32)[:, None] for *_, corners in seen]
     try:
-        error, matrix, lens, turns, shifts = cv2.calibrateCamera(objects, images, (width, height), None, None)
+        # Its stubs do not know that what is to be found may be None.
+        fitted = cv2.calibrateCameraExtended(objects, images, (width, height), None, None)  # type: ignore[call-overload]
     except cv2.error:
         raise InputError(
             f"{path}: expected pictures of a board that tell where the camera is, but those {len(seen)} in which it "
             "was found do not; film all of it, from several sides."
         ) from None
+    error, matrix, lens, turns, shifts = fitted[:5]
+    normals = np.array([cv2.Rodrigues(r)[0][:, 2] for r in turns])
+    unsure = float(fitted[5].ravel()[0] / matrix[0, 0])
+    _check_focal(path, normals, unsure, float(matrix[0, 0]), width)
     report("fitting the camera", 1, 1, f"{error:.2f} px")
     modelled = tuple(
         cv2.projectPoints(o, r, t, matrix, lens)[0][:, 0] for o, r, t in zip(objects, turns, shifts, strict=True)
@@ -143,14 +165,13 @@ def calibrate_camera(
         tuple(map(float, lens.ravel()[:5])),
         fps,
     )
-    normals = np.array([cv2.Rodrigues(r)[0][:, 2] for r in turns])
     return Calibrated(
         camera,
         float(error),
         tuple(k for k, *_ in seen),
         tuple(i[:, 0] for i in images),
         modelled,
-        tuple(_notes(float(error), normals, images, width, height)),
+        tuple(_notes(float(error), unsure, images, width, height)),
         picture,
     )
 
@@ -192,13 +213,27 @@ def _flat(points: np.ndarray) -> bool:
     return min(np.linalg.svd(x - x.mean(0), compute_uv=False)[1] for x in rest) > 1e-6 * np.ptp(points)
 
 
-def _notes(error: float, normals: np.ndarray, images: list[np.ndarray], width: int, height: int) -> list[str]:
+def _check_focal(path: Path, normals: np.ndarray, unsure: float, focal: float, width: int) -> None:
+    """Refuse boards, with these normals (N, 3), from which no focal length [px] follows."""
+    mean = normals.mean(0) / np.linalg.norm(normals.mean(0))
+    spread = float(np.degrees(np.arccos(np.clip(normals @ mean, -1, 1)).max()))
+    angle = 2 * math.degrees(math.atan(0.5 * width / focal))
+    if spread < _TILTED or not _NARROW < angle < _WIDE or not unsure < _UNKNOWN:
+        raise InputError(
+            f"{path}: expected a board that is tilted to several sides, found one from which no focal length follows "
+            f"(the fit says {focal:.0f} px); tilt it by 20 to 40 degrees."
+        )
+
+
+def _notes(error: float, unsure: float, images: list[np.ndarray], width: int, height: int) -> list[str]:
     notes = []
     if error > 1.0:
         notes.append(f"The error of {error:.1f} px is large: is the board flat, and is its size right?")
-    spread = np.degrees(np.arccos(np.clip((normals @ normals.mean(0)) / np.linalg.norm(normals.mean(0)), -1, 1)).max())
-    if spread < 10:
-        notes.append(f"The board was never tilted by more than {spread:.0f} degrees: the focal length is uncertain.")
+    if unsure > _KNOWN:
+        notes.append(
+            f"The focal length is uncertain by {unsure:.0%}, and fits to films take it to be known to {_KNOWN:.0%}: "
+            "film the board again, tilted by 20 to 40 degrees to several sides."
+        )
     every = np.concatenate([i[:, 0] for i in images])
     share = np.ptp(every[:, 0]) * np.ptp(every[:, 1]) / (width * height)
     if share < 0.4:

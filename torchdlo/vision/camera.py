@@ -256,6 +256,8 @@ def load_cameras(path: str | Path) -> tuple[Camera, ...]:
     entries = content.get("cameras") if isinstance(content, dict) else None
     if not isinstance(entries, list) or not 0 < len(entries) <= 100:
         raise InputError(f'{path}: expected {{"cameras": [...]}} with at least one camera, found something else.')
+    if unknown := sorted(set(content) - {"generator", "cameras"}):
+        _refuse(path, one_line(unknown[0], 60), "generator and cameras", "an unknown key")
     cameras = tuple(_camera(path, k, entry) for k, entry in enumerate(entries))
     names = [c.name for c in cameras]
     if len(set(names)) < len(names):

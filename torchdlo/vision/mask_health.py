@@ -22,6 +22,11 @@ _SLIP = 6.0
 _MOVED = 0.1
 """Change of a mask from one frame to the next, as a share of its area, of a rope that moves: about a quarter pixel."""
 
+_CODED, _EVEN, _CAUGHT_UP = 0.02, 0.75, 1.5
+"""Change of a mask, as a share of its area, that a codec makes in a picture that is repeated; that of the last step
+before it, as a share of the one before, of a rope that does not turn back, which has a half; and times as far as before
+from which the rope has caught up after it."""
+
 _CLEAR = 0.1
 """Response of a phase correlation from which a shift is taken for one."""
 
@@ -118,16 +123,35 @@ def _repeated(
     changed = np.array([0, *(np.count_nonzero(a != b) for a, b in zip(masks[1:], masks[:-1], strict=True))])
     same = changed == 0
     same[0] = False
-    if moving is None:
-        return same
-    out = same & moving
     shifts = changed > _MOVED * np.maximum(area, 1.0)
-    rows = np.flatnonzero(same & ~moving)
-    for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
-        # A rope at rest has equal frames as well, but it does not move on both sides of them.
-        if len(run) and run[0] > 1 and run[-1] + 1 < len(masks) and shifts[run[0] - 1] and shifts[run[-1] + 1]:
-            equal = [pictures is None or np.array_equal(pictures[k], pictures[k - 1]) for k in run]
-            out[run[equal]] = True
+    coded = changed <= _CODED * area
+    coded[0] = False
+    coded = _between(coded, shifts, changed)
+    if moving is None:
+        return same | coded
+    out = (same | coded) & moving
+    run = np.flatnonzero(_between(same & ~moving, shifts))
+    equal = [pictures is None or np.array_equal(pictures[k], pictures[k - 1]) for k in run]
+    out[run[equal]] = True
+    return out
+
+
+def _between(rows: np.ndarray, shifts: np.ndarray, changed: np.ndarray | None = None) -> np.ndarray:
+    """Return those of frames (F,) bool before and after whose run the rope moves: one at rest has equal ones, too.
+
+    Where pixels that change (F,) are given, it moves evenly before them, or farther after them than before: one that
+    turns back does neither.
+    """
+    out, at = np.zeros(len(rows), bool), np.flatnonzero(rows)
+    for run in np.split(at, np.flatnonzero(np.diff(at) > 1) + 1):
+        if not len(run) or run[0] < 2 or run[-1] + 1 >= len(rows):
+            continue
+        before, after = run[0] - 1, run[-1] + 1
+        if changed is not None:
+            even = before > 1 and changed[before] > _EVEN * changed[before - 1]
+            if not (even or changed[after] > _CAUGHT_UP * changed[before]):
+                continue
+        out[run] = shifts[before] and shifts[after]
     return out
 
 
