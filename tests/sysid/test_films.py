@@ -107,6 +107,20 @@ def _masks(filmed: Path, masks: np.ndarray) -> None:
     save_masks(masks, filmed / "train_0.a.npz")
 
 
+def _turned(filmed: Path, degrees: float) -> None:
+    """Let the file say that the camera looks past the rope."""
+    view, angle = view_of_sample(), np.radians(degrees)
+    away = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    turn, shift = away @ np.array(view.rotation), away @ np.array(view.translation)
+    save_cameras([replace(view, rotation=tuple(map(tuple, turn)), translation=tuple(shift))], filmed / "cameras.json")
+
+
+def _in_millimetres(filmed: Path) -> None:
+    view = view_of_sample()
+    far = tuple(1000.0 * x for x in view.translation)
+    save_cameras([replace(view, translation=far)], filmed / "cameras.json")
+
+
 def _twice(filmed: Path) -> None:
     recording = load_recording(filmed)
     masks = masks_of(recording, recording.train[0].films[0])[0]
@@ -118,6 +132,8 @@ def _twice(filmed: Path) -> None:
     [
         (lambda f: (f / "train_0.a.mp4").write_bytes(b""), "empty file"),
         (_twice, "two ropes"),
+        (lambda f: _turned(f, 12.0), "px from where camera a has a gripper; check rotation"),
+        (_in_millimetres, "px from where camera a has a gripper; check rotation, translation .m."),
         (
             lambda f: save_cameras([looking_at("a", [0, -1, 1], [0, -2, 1], focal=650.0)], f / "cameras.json"),
             "behind it",
@@ -138,6 +154,24 @@ def test_films_that_cannot_be_used_are_refused(filmed: Path, spoil, message: str
     with pytest.raises(InputError, match=message) as caught:
         views_of(recording, recording.train)
     assert str(caught.value).startswith(str(filmed)) and "\n" not in str(caught.value)
+
+
+def test_a_camera_as_wrong_as_its_prior_is_taken_and_one_farther_off_is_doubted(filmed: Path) -> None:
+    for degrees, doubted in ((1.0, False), (4.5, True)):
+        _turned(filmed, degrees)
+        recording = load_recording(filmed)
+        notes = views_of(recording, recording.train)[1]
+        assert any("has a gripper: check the camera" in note for note in notes) == doubted
+
+
+def test_films_that_last_longer_or_less_than_their_trial_say_so(filmed: Path) -> None:
+    pictures, fps = read_video(filmed / "train_0.a.mp4")
+    write_video(filmed / "train_0.a.mp4", np.concatenate([pictures, pictures[-1:].repeat(9, 0)]), fps)
+    recording = load_recording(filmed)
+    assert any("25 pictures for 0.5 s, which have 16" in note for note in views_of(recording, recording.train)[1])
+    write_video(filmed / "train_0.a.mp4", pictures[:11], fps)
+    recording = load_recording(filmed)
+    assert any("11 pictures for 0.5 s, which have 16" in note for note in views_of(recording, recording.train)[1])
 
 
 def test_films_have_a_rate_of_their_own(filmed: Path) -> None:

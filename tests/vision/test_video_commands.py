@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from torchdlo.cli.app import app, main
 from torchdlo.errors import InputError
 from torchdlo.sysid.recordings.recording import load_recording
 from torchdlo.sysid.video import filmed as filmed_fits
-from torchdlo.sysid.video import filmed_fit
+from torchdlo.sysid.video import filmed_diagnosis, filmed_fit
 from torchdlo.sysid.video.filming import film_recording
 from torchdlo.vision.camera import load_cameras, looking_at, save_cameras, states_rate
 from torchdlo.vision.film import FilmLook
@@ -55,6 +56,8 @@ def test_a_camera_is_calibrated_and_added_to_others(tmp_path: Path) -> None:
             run(*again, "--name", name)
     run("calibrate-camera", "-", "--board", "8x6", "--print-board", tmp_path / "board.png")
     assert (tmp_path / "board.png").exists()
+    with pytest.raises(InputError, match=r"ends in \.png, found .*board\.jpg"):
+        run("calibrate-camera", "-", "--board", "8x6", "--print-board", tmp_path / "board.jpg")
     with pytest.raises(InputError, match="COLUMNSxROWS"):
         run("calibrate-camera", tmp_path / "board.mp4", "--board", "8by6")
 
@@ -148,7 +151,7 @@ def test_a_stopped_calibration_of_films_goes_on_from_its_fits(
     )
     given, out = ["calibrate", str(tmp_path / "rope"), "--starts", "3", "--iterations", "1"], tmp_path / "out"
     with monkeypatch.context() as patched:
-        patched.setattr(filmed_fits, "tested", stop)
+        patched.setattr(filmed_fits, "test_problem", stop)
         with pytest.raises(SystemExit) as ended:
             main([*given, "--out", str(out)])
     said = capsys.readouterr().err
@@ -160,6 +163,25 @@ def test_a_stopped_calibration_of_films_goes_on_from_its_fits(
     with pytest.raises(SystemExit):
         main([*given, "--out", str(out), "--resume"])
     assert "leave out --resume" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["train_0.a.mp4", "test_0.a.mp4"])
+@pytest.mark.parametrize("command", ["calibrate", "diagnose"])
+def test_a_film_that_is_refused_leaves_nothing_behind(
+    command: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(DATA / "sample_film", tmp_path / "rope")
+    (tmp_path / "rope" / name).write_bytes(b"")
+
+    def fitted(*_: object, **__: object) -> None:
+        raise AssertionError("test films are looked at before any fit")
+
+    monkeypatch.setattr(filmed_fits, "baseline", fitted)
+    monkeypatch.setattr(filmed_diagnosis, "baseline", fitted)
+    out = tmp_path / "out"
+    with pytest.raises(InputError, match=f"{name}: expected a film, found an empty file"):
+        run(command, tmp_path / "rope", "--out", out / "model.json" if command == "calibrate" else out)
+    assert not out.exists() or not list(out.iterdir())
 
 
 def test_the_film_in_the_package_is_small_and_sound() -> None:

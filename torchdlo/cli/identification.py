@@ -402,4 +402,6 @@ def _write_outputs(result: Calibration, recording: Recording, given: Path, out: 
     write_atomically(out.with_name("calibration.json"), summary_json(result, given))
     page, _ = report.write_report(result, recording, out.parent, command=command)
     typer.echo(report.calibration_verdict(result, recording), err=quiet)
+    for note in result.notes if recording.filmed else ():
+        typer.echo(f"note: {note}", err=quiet)
     typer.echo(f"model:  {out}\nreport: {page}", err=quiet)

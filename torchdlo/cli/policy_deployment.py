@@ -37,7 +37,7 @@ def distill(
     resume: Annotated[bool, typer.Option("--resume", help="Go on after the last round that is there.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print how it went as JSON.")] = False,
 ) -> None:
-    """Teach a policy that sees 384 points of the rope to do what a policy that sees the state does.
+    """Teach a policy that sees 384 points of rope and fixtures to do what a policy that sees the state does.
 
     The points are those of a noisy depth camera that stands elsewhere in each episode.
 

@@ -33,6 +33,10 @@ def write_report(result: Calibration, recording: Recording, folder: Path, *, com
     return folder / PAGE, folder / PICTURE
 
 
+_FAR = 0.05
+"""Distance from unseen films from which a model does not follow them, as a share of the rope's length."""
+
+
 def films_verdict(result: Calibration, recording: Recording) -> str:
     """The result in one sentence."""
     tests = [t for t in result.per_trial if t["split"] == "test"]
@@ -45,7 +49,11 @@ def films_verdict(result: Calibration, recording: Recording) -> str:
         f"{_mm(result.before['test_mae_mm'])} → {_mm(result.test_mae_mm)} ({pixels:.1f} px) from the simulated one, "
         f"and masks overlap by {share:.0%}."
     )
-    return summary if better else summary + " Calibration did not help on the unseen films: do not use this."
+    if not better:
+        return summary + " Calibration did not help on the unseen films: do not use this."
+    if 1e-3 * result.test_mae_mm > _FAR * recording.length:
+        return summary + " The model does not follow the unseen films: do not use this, and check the cameras."
+    return summary
 
 
 def overlay_png(overlays: list[Overlay]) -> bytes:

@@ -124,6 +124,11 @@ class ResultCache:
         self._journal = Journal(path, mark, suffix=".npz", other=other, resume=resume, old=(b"PK",))
         self.results = Results(self._journal.records)
 
+    @property
+    def begun(self) -> bool:
+        """Whether any result is written down."""
+        return any(self.path.glob("*.npz"))
+
     def close(self) -> None:
         """Let others write here."""
         self._journal.close()

@@ -67,7 +67,6 @@ __all__ = [
     "require_simulated",
     "sharper",
     "test_problem",
-    "tested",
 ]
 
 Callback = Callable[[str, int, int, str], None]
@@ -124,6 +123,8 @@ def calibrate_filmed(
     begun = time.perf_counter()
     report = callback or (lambda *_: None)
     views, notes = views_of(recording, recording.train, report)
+    # Test films that cannot be used are refused now, and not when the fit is done.
+    unseen = views_of(recording, recording.test, report)
     own, first, best = baseline(recording, views, starts, iterations, seed, vertices, given, report)
     if method == "gradient":
         own, first, best = _by_gradient(own, first, best, iterations, report)
@@ -134,7 +135,9 @@ def calibrate_filmed(
         notes.append(f"{where}: frames {', '.join(map(str, sorted(frames)))} stay far from the rope: left out.")
     notes += [f"{trial.name} counts up to {trial.time:.2f} s only: {trial.why}." for trial in own.misleading]
     report("judging", 0, 1, "")
-    found = [_judged(recording, split, own, first, values, notes, report) for split in ("train", "test")]
+    here = test_problem(own, recording.test, unseen[0], values)
+    notes += [*unseen[1], *begun_elsewhere(here)]
+    found = [_judged(*each, first, values, notes) for each in (("train", own), ("test", here))]
     report("judging", 1, 1, "")
     trials = [t for f in found for t in f.trials]
     if method != "gradient" and (view := second_view(own, best.raw)) is not None:
@@ -235,18 +238,10 @@ def _by_gradient(
     return fuller, both[0], sharper if sharper.cost < _WORSE * found.cost else found
 
 
-def tested(
-    own: FilmedProblem, recording: Recording, values: np.ndarray, report: Callback
-) -> tuple[FilmedProblem, list[str]]:
-    """Return the problem of the test trials, which begin as their first frames say with numbers (N,), and remarks."""
-    views, said = views_of(recording, recording.test, report)
-    return test_problem(own, recording.test, views, values), said
-
-
 def test_problem(
     own: FilmedProblem, trials: Sequence[Trial], views: Sequence[FilmView], values: np.ndarray
 ) -> FilmedProblem:
-    """Return the problem of test trials that were filmed, see `tested`."""
+    """Return the problem of test trials that were filmed, which begin as their first pictures say with numbers (N,)."""
     spines = Spines(
         unfitted_clocks(views, own.spines.views), own.model.dt, own.extent, own.spines.free, own.spines.sure
     )
@@ -415,20 +410,9 @@ class _Judged:
     """Trials that begin in motion."""
 
 
-def _judged(
-    recording: Recording,
-    split: str,
-    own: FilmedProblem,
-    first: np.ndarray,
-    values: np.ndarray,
-    notes: list[str],
-    report: Callback,
-) -> _Judged:
+def _judged(split: str, here: FilmedProblem, first: np.ndarray, values: np.ndarray, notes: list[str]) -> _Judged:
     """Return what numbers (K + Q,) are worth, beside those that the fit began with; what is wrong goes into notes."""
-    here, numbers = own, len(own.free)
-    if split == "test":
-        here, said = tested(own, recording, values, report)
-        notes += [*said, *begun_elsewhere(here)]
+    numbers = len(here.free)
     other = replace(here)
     time_films(other, first)
     old, _ = picture_errors(other, first)

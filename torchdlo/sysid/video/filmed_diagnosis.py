@@ -124,9 +124,9 @@ def _diagnosed(
 ) -> Diagnosis:
     begun = time.perf_counter()
     views, notes = views_of(recording, recording.train, report)
+    unseen, said = views_of(recording, recording.test, report)
     near = np.inf if recording.still else NEAR
     own, _, best = baseline(recording, views, FILMED_STARTS, 15, seed, vertices, given, report, near)
-    unseen, said = views_of(recording, recording.test, report)
     films = Films(own, recording.test, unseen)
     base = nearer(films, best, report) if film_gaps(own, best).max() > near else films.test(own, best)
     if given is None and not recording.still:

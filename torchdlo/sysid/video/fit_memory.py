@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from torchdlo.errors import InputError
 from torchdlo.sysid.estimation.result_cache import ResultCache, Results
 
 if TYPE_CHECKING:
@@ -45,6 +46,11 @@ def remembering(path: Path | None, *about: Any, **how: Any) -> Iterator[None]:
     remember(cache.results)
     try:
         yield
+    except InputError:
+        # What is refused before anything was done leaves nothing behind.
+        if not cache.begun:
+            cache.remove()
+        raise
     finally:
         remember(before)
         cache.close()

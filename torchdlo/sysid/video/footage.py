@@ -49,7 +49,17 @@ _DRIFT = 0.25
 """Pictures by which films of one camera may come apart from a common rate by their ends."""
 
 _FRAMES_OFF = 3
-"""Pictures by which masks without times may differ from the length of their trial: a clock may be off so much."""
+"""Pictures by which films may differ from the length of their trial: a clock may be off so much."""
+
+_BESIDE, _APART = 0.15, 0.25
+"""Distance in the picture between a gripper and the rope that is said, and from which a camera cannot be right, as
+shares of the rope's length there. Of films that were made it was 0.1 at most: hands hide a part of the rope."""
+
+_LOOKED_AT = 12
+"""Pictures in which grippers are looked for."""
+
+_FAR_MORE = 4.0
+"""Times its length from which what is seen is not a second rope, but one that a wrong camera sees far too large."""
 
 _LATE = 0.15
 """Share of a trial that may have passed when its first film begins."""
@@ -187,8 +197,7 @@ def _reduced(
     if trial.still:
         return _photographed(trial, film, masks, pictures, notes)
     rows = slice(early, early + _lasting(trial, film, len(masks) - early))
-    if own_rate is None:
-        _check_length(trial, film, len(masks) - early, notes)
+    _check_length(trial, film, len(masks) - early, notes, refuse=own_rate is None)
     masks, pictures = masks[rows], None if pictures is None else pictures[rows]
     count = len(masks)
     time = film.camera.start + np.arange(count) / film.camera.fps
@@ -197,6 +206,7 @@ def _reduced(
     where = np.stack([np.interp(time, trial.time, column) for column in flat.T], 1)
     moving = np.zeros(count, bool)
     moving[1:] = np.abs(np.diff(where, axis=0)).max(1) > _STILL
+    _check_grips(recording, trial, film, masks, where.reshape(count, -1, 3), notes)
     good, issues = check_masks(masks, str(film.path), pictures=pictures, moving=moving)
     notes += [f"{trial.name}, camera {film.camera.name}: {i.text}." for i in issues]
     suspect = np.interp(time, trial.time, trial.suspect.astype(float)) > 0
@@ -233,11 +243,16 @@ def _lasting(trial: Trial, film: FilmFile, count: int) -> int:
     return inside
 
 
-def _check_length(trial: Trial, film: FilmFile, count: int, notes: list[str]) -> None:
-    """Refuse masks that have no times and last longer than their trial; say it of shorter ones."""
+def _check_length(trial: Trial, film: FilmFile, count: int, notes: list[str], *, refuse: bool) -> None:
+    """Say of films that they last longer than their trial or less, and refuse longer masks, which have no times."""
     fps, lasts = film.camera.fps, trial.time[-1] - film.camera.start
     expected = int(lasts * fps + 0.25) + 1
-    if count > expected + _FRAMES_OFF:
+    if count > expected + _FRAMES_OFF and not refuse:
+        notes.append(
+            f"{trial.name}, camera {film.camera.name}: {count} pictures for {lasts:.3g} s, which have {expected} at "
+            f"{fps:g} per second: those after the trial do not count; check start if the camera stopped with it."
+        )
+    elif count > expected + _FRAMES_OFF:
         raise InputError(
             f"{film.path}: expected {expected} pictures for the {trial.time[-1]:g} s of {trial.name}.npz at {fps:g} "
             f"per second, found {count}; set fps and start in cameras.json, or leave out what is after the trial."
@@ -262,9 +277,47 @@ def _nearest(trial: Trial, film: FilmFile) -> float:
     return nearest
 
 
+def _check_grips(
+    recording: Recording, trial: Trial, film: FilmFile, masks: np.ndarray, held: np.ndarray, notes: list[str]
+) -> None:
+    """Refuse a camera that sees the rope far from where it has the grippers, which are at (F, K, 3) [m]."""
+    seen = np.flatnonzero(masks.any((1, 2)))
+    if not len(seen):
+        return
+    rows = seen[np.unique(np.linspace(0, len(seen) - 1, _LOOKED_AT).round().astype(int))]
+    pixel, depth = (x[0].numpy() for x in project(lens([film.camera]), torch.as_tensor(held[rows])[None]))
+    away = np.full(pixel.shape[:2], np.nan)
+    high, wide = masks.shape[1:]
+    for k, row in enumerate(rows):
+        inside = ((pixel[k] >= -0.5) & (pixel[k] <= [wide - 0.5, high - 0.5])).all(1)
+        cut = masks[row][[0, -1]].any() or masks[row][:, [0, -1]].any()
+        # Of a rope that leaves the picture grippers may be anywhere out of it.
+        counts = inside if cut else np.ones(len(inside), bool)
+        rope = np.argwhere(masks[row])[:, ::-1]
+        away[k, counts] = np.linalg.norm(pixel[k, counts, None] - rope, axis=-1).min(1)
+    usual = [np.median(column[np.isfinite(column)]) for column in away.T if np.isfinite(column).any()]
+    if not usual:
+        return
+    far = float(np.max(usual))
+    share = far * float(np.median(depth)) / (0.5 * (film.camera.fx + film.camera.fy) * recording.length)
+    found = f"the rope {far:.0f} px from where camera {film.camera.name} has a gripper"
+    if share > _APART:
+        raise InputError(
+            f"{film.path}: expected the rope at the grippers of {trial.name}.npz, found {found}; check rotation, "
+            "translation [m] and fx of the camera, and whether this film is of this trial."
+        )
+    if share > _BESIDE:
+        notes.append(f"{trial.name}: found {found}: check the camera, unless something hides the rope there.")
+
+
 def _check_amount(recording: Recording, film: FilmFile, pixels: float, nearest: float) -> None:
     """Refuse masks that hold far more than one rope, whose centre lines have so many pixels in the usual picture."""
     seen = pixels * nearest / (0.5 * (film.camera.fx + film.camera.fy))
+    if seen > _FAR_MORE * recording.length:
+        raise InputError(
+            f"{film.path}: expected a rope of {recording.length:.3g} m, found {seen:.2g} m of it as camera "
+            f"{film.camera.name} sees it; check that translation in cameras.json is in m, and fx in pixels."
+        )
     if seen > _TOO_MUCH * recording.length:
         raise InputError(
             f"{film.path}: expected a rope of {recording.length:.3g} m, found {seen:.2g} m of it in the masks: two "
