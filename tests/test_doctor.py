@@ -14,6 +14,7 @@ import pytest
 from torchdlo import cache
 from torchdlo.cli import app, doctor
 from torchdlo.physics.kernels import native
+from torchdlo.sysid.recordings.recording import load_recording
 
 pytestmark = pytest.mark.quick
 
@@ -130,6 +131,14 @@ def test_the_real_machine_is_looked_at():
     kernels = next(check for check in content["checks"] if check["name"] == "kernels")
     if native.compiler() is not None:
         assert kernels["found"] == "16 built and loaded"
+
+
+def test_films_of_the_sample_are_copied_as_well(tmp_path, capsys):
+    folder = tmp_path / "filmed"
+    with pytest.raises(SystemExit) as ended:
+        app.main(["sample", str(folder), "--film"])
+    assert not ended.value.code and f"torchdlo calibrate {folder}" in capsys.readouterr().out
+    assert load_recording(folder).filmed
 
 
 def test_the_sample_is_a_recording_of_ones_own(tmp_path, capsys):

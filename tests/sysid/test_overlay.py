@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
+from torchdlo.report.pages.films_page import _shown, overlay_png
+from torchdlo.sysid.estimation.result import Overlay
 from torchdlo.sysid.recordings.recording import load_recording
 from torchdlo.sysid.video.filming import centre_line, film_recording
 from torchdlo.sysid.video.footage import views_of
@@ -57,3 +59,16 @@ def test_rectangles_that_are_left_out_of_masks_are_hidden(behind_a_bar) -> None:
     file.write_text(json.dumps({"hue": [100, 180], "ignore": [[0.0, 0.0, 0.25, 0.5]]}))
     assert hidden_area(own, 0, sims + np.array([0.0, 0.0, 0.05]), np.zeros(8)).sum() == 160 * 240
     file.unlink()
+
+
+def test_pictures_show_the_ropes_with_a_margin() -> None:
+    picture = np.full((480, 640), 200, np.uint8)
+    rope = np.stack([np.linspace(200, 400, 9), np.full(9, 100.0)], 1)
+    sides, ends = _shown(Overlay("t", "test", picture, rope + np.array([0, 20]), rope))
+    assert sides == pytest.approx((148.8, 451.2)) and ends == pytest.approx((48.8, 171.2))
+    # What is not in the picture, or not known, does not count; without any rope all of it is shown.
+    away = np.concatenate([rope, [[9e3, 9e3], [np.nan, np.nan]]])
+    assert _shown(Overlay("t", "test", picture, away, away))[0] == pytest.approx((148.8, 451.2))
+    lost = Overlay("t", "test", picture, away[-2:], away[-2:])
+    assert _shown(lost) == ((-0.5, 639.5), (-0.5, 479.5))
+    assert overlay_png([lost]).startswith(b"\x89PNG")

@@ -56,6 +56,19 @@ def films_verdict(result: Calibration, recording: Recording) -> str:
     return summary
 
 
+def _shown(overlay: Overlay) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the part of a picture that simulated ropes are in, with a margin: columns, then rows [px]."""
+    ropes = np.concatenate([overlay.before, overlay.after])
+    height, width = overlay.picture.shape
+    ends = []
+    for places, size in zip(ropes.T, (width, height), strict=True):
+        inside = places[np.isfinite(places) & (places > -0.5) & (places < size - 0.5)]
+        low, high = (inside.min(), inside.max()) if len(inside) else (0.0, size - 1.0)
+        margin = 0.08 * width
+        ends.append((max(low - margin, -0.5), min(high + margin, size - 0.5)))
+    return ends[0], ends[1]
+
+
 def overlay_png(overlays: list[Overlay]) -> bytes:
     """Return a PNG of pictures with the rope before and after; test trials first."""
     from matplotlib.figure import Figure
@@ -71,10 +84,11 @@ def overlay_png(overlays: list[Overlay]) -> bytes:
         axis.axis("off")
     for axis, each in zip(axes, chosen, strict=False):
         axis.imshow(each.picture, cmap="gray", vmin=0, vmax=255, alpha=0.9)
-        axis.plot(*each.before.T, color="#e0552f", lw=1.2, ls="--", label="before")
-        axis.plot(*each.after.T, color="#00c2d6", lw=1.2, label="calibrated")
-        height, width = each.picture.shape
-        axis.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
+        axis.plot(*each.before.T, color="#e0552f", lw=1.0, ls="--", label="before")
+        # Thinner than the rope, which has to be seen beside it.
+        axis.plot(*each.after.T, color="#00c2d6", lw=0.6, label="calibrated")
+        (left, right), (top, bottom) = _shown(each)
+        axis.set(xlim=(left, right), ylim=(bottom, top), xticks=[], yticks=[])
         axis.set_title(for_plot(each.title), fontsize=10)
     if chosen:
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from torchdlo.errors import InputError
+from torchdlo.physics.effects.table import TableFriction
 from torchdlo.sysid.diagnosis.budget import model_options as suited
 from torchdlo.sysid.estimation.observation import (
     POSE,
@@ -484,6 +485,11 @@ def _remarks(own: FilmedProblem, values: np.ndarray, low: np.ndarray, high: np.n
         for view in own.spines.views
         if view.clocks != ("",) and not view.camera.starts
     ]
+    if own.model.recording.table_height is not None and TableFriction.name not in own.model.effects:
+        out.append(
+            "Friction on the table is not testable here: the rope of this model slides without any; torchdlo diagnose "
+            "looks for it."
+        )
     moving = [t.name for t, calm in zip(own.trials, own.start.at_rest, strict=True) if not calm]
     if moving:
         out.append(
