@@ -10,11 +10,13 @@ import pytest
 import torch
 
 from torchdlo.sysid.estimation.observation import Spines, seen_by
+from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import load_recording
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, begin_from_balance, filmed_problem
 from torchdlo.sysid.video.filmed_starts import START_WINDOW, start_window
 from torchdlo.sysid.video.first_pictures import look_at_first_pictures
 from torchdlo.sysid.video.footage import views_of
+from torchdlo.vision.camera import looking_at
 
 DATA = Path(__file__).parents[2] / "torchdlo" / "data"
 
@@ -38,6 +40,20 @@ def pixels(own: FilmedProblem, motion: np.ndarray) -> np.ndarray:
     return seen_by(own.spines.views[0], sims, torch.zeros(1, 8), own.model.dt)[0][0, 0].numpy()
 
 
+def shown(own: FilmedProblem, true: Start) -> np.ndarray:
+    """Let the camera see ropes that go on as they begin, and return where in its pictures they are, (F, M, 2)."""
+    times = own.model.dt * np.arange(own.motion.markers.shape[1])
+    seen = pixels(own, true.pos[0] + true.vel[0] * times[:, None, None])
+    along = np.diff(seen, axis=1)
+    parts = {
+        "places": seen[None, :, :-1] + 0.5 * along,
+        "tangents": along[None] / np.linalg.norm(along[None], axis=-1)[..., None],
+    }
+    view = replace(own.spines.views[0], good=np.ones_like(own.spines.views[0].good), **parts)
+    own.spines = Spines([view], own.model.dt, own.extent, own.spines.free)
+    return seen
+
+
 def beside(points: np.ndarray, line: np.ndarray) -> float:
     """Return the largest distance of points from the nearest place of a line [px]."""
     fine = np.stack([np.interp(np.linspace(0, 1, 2000), np.linspace(0, 1, len(line)), x) for x in line.T], 1)
@@ -52,16 +68,7 @@ def test_a_rope_that_hangs_elsewhere_is_found_where_its_first_pictures_show_it(
     modes = np.zeros((1, 2, own.shapes.shape[1], 3))
     modes[0, 0, 0], modes[0, 1, 0] = side * across, 2 * across
     true = own.begin(modes.reshape(1, 1, -1))
-    times = own.model.dt * np.arange(own.motion.markers.shape[1])
-    motion = true.pos[0] + true.vel[0] * times[:, None, None]
-    seen = pixels(own, motion)
-    along = np.diff(seen, axis=1)
-    parts = {
-        "places": seen[None, :, :-1] + 0.5 * along,
-        "tangents": along[None] / np.linalg.norm(along[None], axis=-1)[..., None],
-    }
-    view = replace(own.spines.views[0], good=np.ones_like(own.spines.views[0].good), **parts)
-    own.spines = Spines([view], own.model.dt, own.extent, own.spines.free)
+    seen = shown(own, true)
     look_at_first_pictures(own, raw_of(own))
     off, balance = (beside(pixels(own, pos)[0], seen[0]) for pos in (own.begin(own.offset[None]).pos, own.start.pos))
     assert balance > 25 and off < 2
@@ -77,6 +84,23 @@ def test_what_was_shown_is_kept_where_ropes_of_another_stiffness_are_in_balance(
     assert np.abs(own.start.pos - balance).max() > 5e-3
     there = own.moved(own.offset[None]).pos
     assert np.abs(there - own.shown.pos).max() < 0.2 * np.abs(own.start.pos - own.shown.pos).max()
+
+
+def test_one_camera_sees_how_far_away_a_rope_on_a_table_is(swing: FilmedProblem) -> None:
+    camera = looking_at("a", [0.15, -1.0, 1.9], [0.0, 0.0, 0.88], focal=650.0)
+    views = [replace(swing.spines.views[0], camera=camera)]
+    away, off = np.array(camera.rotation)[2] * [1, 1, 0], {}
+    for height in (None, float(swing.start.pos[..., 2].min()) - 0.01):
+        recording = replace(swing.model.recording, table_height=height)
+        own = filmed_problem(recording, swing.trials, views, options={"vertices": 13})
+        modes = np.zeros((1, 2, own.shapes.shape[1], 3))
+        modes[0, 0, 0] = 0.1 * away / own.reach[0]
+        true = own.begin(modes.reshape(1, 1, -1))
+        shown(own, true)
+        look_at_first_pictures(own, raw_of(own))
+        found = own.begin(own.offset[None]).pos[0] - true.pos[0]
+        off[height is None] = np.abs(found @ away / np.linalg.norm(away)).max()
+    assert off[False] < 0.01 and off[True] > 3 * off[False], off
 
 
 def test_ropes_do_not_begin_below_the_table(swing: FilmedProblem) -> None:

@@ -41,8 +41,12 @@ STRETCHES = 14
 _CALM = 0.03
 """Speed of a gripper below which it is at rest [m/s]."""
 
-_SHIFT, _DRIFT = 0.03, 0.3
-"""How far shapes [m] and speeds [m/s] at the start usually are from those of a rope at rest that is carried along."""
+_REACH = np.array([[0.03] * 3, [0.3] * 3])
+"""How far shapes [m] and speeds [m/s] at the start usually are from those of a rope at rest that is carried along, by
+axis."""
+
+_ON_TABLE = np.array([2.0, 2.0, 0.3])
+"""Times as far as that along a table and above it: a rope there may lie anywhere, but it lies there."""
 
 
 @dataclass(eq=False)
@@ -232,12 +236,17 @@ class FilmedProblem:
         more = None if known is None else np.tile(known, (len(offsets), 1, 1, 1))
         return replace(moved, discretisation_correction=more)
 
+    @property
+    def reach(self) -> np.ndarray:
+        """How far places [m] and speeds [m/s] at the start usually are from those of `start`, by axis, shape (2, 3)."""
+        return _REACH * (1.0 if self.model.recording.table_height is None else _ON_TABLE)
+
     def moved(self, offsets: np.ndarray) -> Start:
         """Return starts with offsets (P, B, J) as they are: longer ropes, and some below the table."""
         mode = offsets.reshape(*offsets.shape[:2], 2, -1, 3)
         pos, vel = (
             (x[None] + size * np.einsum("mj,pbjc->pbmc", self.shapes, mode[:, :, k])).reshape(-1, *x.shape[1:])
-            for k, (x, size) in enumerate(((self.start.pos, _SHIFT), (self.start.vel, _DRIFT)))
+            for k, (x, size) in enumerate(zip((self.start.pos, self.start.vel), self.reach, strict=True))
         )
         return Start(pos, vel, np.tile(self.start.at_rest, len(offsets)))
 
@@ -246,8 +255,8 @@ class FilmedProblem:
         """Offsets (B, J) of starts that no fit has led astray: as first pictures show them, or of ropes in balance."""
         if self.shown is None or not self.offset.shape[1]:
             return np.zeros_like(self.offset)
-        ways = ((self.shown.pos, self.start.pos, _SHIFT), (self.shown.vel, self.start.vel, _DRIFT))
-        off = np.stack([(there - here) / size for there, here, size in ways], 1)
+        ways = (self.shown.pos - self.start.pos, self.shown.vel - self.start.vel)
+        off = np.stack([way / size for way, size in zip(ways, self.reach, strict=True)], 1)
         return np.einsum("jm,bkmc->bkjc", np.linalg.pinv(self.shapes), off).reshape(self.offset.shape)
 
     def _laid(self, pos: np.ndarray) -> np.ndarray:
