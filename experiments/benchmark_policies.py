@@ -78,7 +78,7 @@ def run(name: str, algo: str, seed: int, chosen: Any) -> None:
     from torchdlo.agents.policies import load_policy
     from torchdlo.agents.rl.evaluate import evaluate_policies
     from torchdlo.agents.rl.hybrid_stages import STAGES, plan_of, train_hybrid
-    from torchdlo.agents.rl.results import prepare_training, train_json
+    from torchdlo.agents.rl.results import prepare_training, train_json, train_result
     from torchdlo.agents.rl.settings import training_preset
     from torchdlo.agents.rl.training import train
     from torchdlo.agents.trajopt.stored import ARCHIVE, unpack_searches
@@ -119,7 +119,7 @@ def run(name: str, algo: str, seed: int, chosen: Any) -> None:
         trainer, played = prepare_training(task, settings, execution="compiled")
         resume = (folder / "checkpoint.pt").exists()
         found = train(trainer, played, settings, folder=folder, resume=resume, callback=told)
-        (folder / "result.json").write_text(train_json(task, settings, found))
+        (folder / "result.json").write_text(train_json(train_result(task, settings, found)))
     if chosen.train_only and not chosen.judge:
         return
     results, _ = evaluate_policies([load_policy(folder)], task, starts=chosen.starts, seed=chosen.reset_seed)

@@ -67,7 +67,7 @@ def test_a_page_says_what_training_came_to():
 def test_nothing_learned_is_said():
     none = copy.deepcopy(RESULT) | {"curve": [], "best_batch": None, "interrupted": False}
     page = training_html(none)
-    assert "Nothing was learned" in page and not pictures(page) and "was stopped" not in page
+    assert "No policy has played" in page and not pictures(page) and "was stopped" not in page
 
 
 def test_the_page_of_a_hybrid_has_the_stages_that_were_run():

@@ -171,7 +171,8 @@ def plan(
     population: Annotated[int, typer.Option(min=4, help="Trajectories per iteration.")] = 24,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the searches.")] = 0,
     reset_seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of a start that differs from the usual one.", metavar="SEED")
+        int | None,
+        typer.Option(min=0, max=10**9, help="Seed of a start that differs from the usual one.", metavar="SEED"),
     ] = None,
     pictures: Annotated[bool, typer.Option(help="Draw pictures, and show them to the model.")] = True,
     calls: _Calls = 60,

@@ -191,16 +191,17 @@ def _train(
             found = loop(trainer, played, settings, folder=out, resume=resume, callback=callback)
     finally:
         played.close()
-    result = train_json(task, settings, found)
-    write_atomically(out / "result.json", result)
+    result = train_result(task, settings, found)
+    write_atomically(out / "result.json", train_json(result))
     if found.rows:
         write_atomically(out / "curve.png", training_png({f"{task.name}, {settings.algorithm}": found.rows}))
-    write_atomically(out / "report.html", training_html(train_result(task, settings, found)))
-    best = f"best batch: success {found.best[0]:.0%}, return {found.best[1]:.4g}" if found.rows else "nothing learned"
+    write_atomically(out / "report.html", training_html(result))
+    told = result["best_batch"]
+    best = f"best batch: success {told['success']:.0%}, return {told['return']:.4g}" if told else "no batch by a policy"
     typer.echo(f"{task.name}: {found.episodes} episodes, {best}", err=as_json)
     typer.echo(f"policy: {out / 'policy.pt'}\nlog:    {out / 'log.csv'}\npage:   {out / 'report.html'}", err=as_json)
     if as_json:
-        typer.echo(result, nl=False)
+        typer.echo(train_json(result), nl=False)
     if found.interrupted:
         raise stopped("the best so far is kept", resume=True)
 
@@ -238,7 +239,9 @@ def _hybrid(
             spent += f"; the budget of {ended} ended it" if ended else ""
             typer.echo(f"{name + ':':8}{spent}", err=as_json)
     write_atomically(out / "report.html", hybrid_html(notes, STAGES))
-    typer.echo(f"policy: {out / 'policy.pt'}\npage:   {out / 'report.html'}", err=as_json)
+    if set(stages) != {"robust"} or (out / "clone.pt").is_file():
+        typer.echo(f"policy: {out / 'policy.pt'}", err=as_json)
+    typer.echo(f"page:   {out / 'report.html'}", err=as_json)
     if as_json:
         typer.echo(json.dumps(notes, indent=1))
 
@@ -297,7 +300,10 @@ def evaluate(
         ),
     ] = None,
     reset_seed: Annotated[
-        int, typer.Option(min=0, help="Seed of the unseen starts: another one for starts that no judgement has seen.")
+        int,
+        typer.Option(
+            min=0, max=10**9, help="Seed of the unseen starts: another one for starts that no judgement has seen."
+        ),
     ] = 0,
     perturb: Annotated[
         bool,

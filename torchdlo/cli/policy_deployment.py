@@ -94,7 +94,7 @@ def export(
     if isinstance(found, CloudPolicy):
         raise InputError(f"{policy}: it sees clouds of points; export takes policies that see the state.")
     out = out or (policy / "policy.pt" if policy.is_dir() else policy).with_suffix(f".{kind}")
-    check_writable(out, mark=b"")
+    check_writable(out, mark={"onnx": b"pytorch", "torchscript": b"PK"}.get(kind, b"torchdlo"))
     write(found, out, kind)
     typer.echo(f"policy: {out}")
 
@@ -108,7 +108,8 @@ def deploy(
         str, typer.Option("--format", help="ros2 has the shape of trajectory_msgs.", metavar="csv|json|ros2")
     ] = "csv",
     reset_seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of a start that differs from the usual one.", metavar="SEED")
+        int | None,
+        typer.Option(min=0, max=10**9, help="Seed of a start that differs from the usual one.", metavar="SEED"),
     ] = None,
     urdf: Annotated[
         Path | None, typer.Option(help="Arms of another kind, which follow the tools' path.", metavar="FILE")
@@ -137,6 +138,8 @@ def deploy(
     from torchdlo.agents import deployment
     from torchdlo.agents.policies import Policy
 
+    if tool is not None and urdf is None:
+        raise InputError(f"--tool {tool}: it is a link of another arm; give --urdf, too.")
     if kind not in deployment.FORMATS:
         raise InputError(f"--format {kind}: expected one of {', '.join(deployment.FORMATS)}.")
     task, what = _source(source, own, rope_model)

@@ -43,7 +43,9 @@ def play(
     no_op: Annotated[bool, typer.Option("--no-op", help="Do nothing: all actions are zero.")] = False,
     reset_seed: Annotated[
         int | None,
-        typer.Option(min=0, help="Seed of a reset with noise; without it, the nominal start.", metavar="SEED"),
+        typer.Option(
+            min=0, max=10**9, help="Seed of a reset with noise; without it, the nominal start.", metavar="SEED"
+        ),
     ] = None,
     out: Annotated[
         Path | None,

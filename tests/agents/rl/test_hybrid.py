@@ -206,7 +206,8 @@ def test_an_earlier_search_is_taken_if_its_seed_was_the_same(tmp_path: Path, mon
         return SimpleNamespace(interrupted=True, outcome=SimpleNamespace(success=torch.tensor([True])))
 
     monkeypatch.setattr(search, "optimize", stop)
-    monkeypatch.setattr(stages, "train_hybrid", lambda *_, **__: (None, {}))
+    notes = {"task": "lead", "plan": {}, "settings": {}}
+    monkeypatch.setattr(stages, "train_hybrid", lambda *_, **__: (None, notes))
     folder = tmp_path / "search"
     folder.mkdir()
     (folder / "trajectory.json").write_text("{}")
@@ -222,6 +223,31 @@ def test_an_earlier_search_is_taken_if_its_seed_was_the_same(tmp_path: Path, mon
         app.main(["train", "lead", "--out", str(tmp_path), "--seed", "3"])
     said = capsys.readouterr().err
     assert done.value.code == 2 and "result.json: expected a result of a search" in said
+
+
+def test_the_first_stage_alone_makes_no_policy_and_its_path_is_kept_where_it_is_left_out(tmp_path: Path):
+    file, folder = found(tmp_path), tmp_path / "run"
+    told: list[str] = []
+    with pytest.raises(InputError, match="stages: none is left"):
+        train_hybrid(Lead(), [file], settings(), folder=folder, plan=PLAN, stages=())
+    train_hybrid(Lead(), [file], settings(), folder=folder, plan=PLAN, stages=("robust",))
+    path = (folder / "expert.json").read_bytes()
+    assert not (folder / "policy.pt").exists()
+    choices = {"folder": folder, "plan": PLAN, "callback": lambda *said: told.append(said[3])}
+    train_hybrid(Lead(), [file], settings(), stages=("clone",), **choices)
+    assert (folder / "expert.json").read_bytes() == path and (folder / "policy.pt").is_file()
+    assert any("the path is taken from" in said for said in told)
+
+
+def test_ctrl_c_in_the_last_stage_leaves_the_clone_as_the_policy(tmp_path: Path):
+    def stop(stage: str, *_) -> None:
+        if stage == "tune":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path / "run", plan=PLAN, callback=stop)
+    clone, policy = (load_policy(tmp_path / "run" / name) for name in ("clone.pt", "policy.pt"))
+    assert all(torch.equal(a, b) for a, b in zip(clone.parameters(), policy.parameters(), strict=True))
 
 
 class Vain(Lead):

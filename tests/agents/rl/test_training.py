@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
@@ -51,6 +52,18 @@ def bits(found: Trained) -> list:
 def test_the_same_seed_gives_the_same_bits_and_another_does_not(name: str):
     assert bits(run(name, 3)) == bits(run(name, 3))
     assert bits(run(name, 3)) != bits(run(name, 3, seed=1))
+
+
+def test_random_actions_of_the_warm_up_are_no_merit_of_a_policy():
+    found = run("sac", 1)
+    assert found.best == (-math.inf, -math.inf) and found.policy.normaliser.count > 0
+    found = run("sac", 3, warm=2)
+    assert found.best == (found.rows[2]["success"], found.rows[2]["return"])
+
+
+@pytest.mark.parametrize("name", ["shac", "sapo"])
+def test_the_best_policy_sees_through_the_normaliser_with_which_it_played(name: str):
+    assert run(name, 1).policy.normaliser.count > 0
 
 
 @pytest.mark.parametrize("name", KINDS)

@@ -13,7 +13,7 @@ pytest.importorskip("torchrl")
 
 from torchdlo.agents.policies import load_policy
 from torchdlo.agents.rl.episodes import TaskEpisodes
-from torchdlo.agents.rl.results import prepare_training, train_json
+from torchdlo.agents.rl.results import prepare_training, train_json, train_result
 from torchdlo.agents.rl.settings import TrainingSettings, training_preset
 from torchdlo.agents.rl.training import train
 from torchdlo.agents.torch_records import load_checkpoint, save_checkpoint
@@ -89,7 +89,7 @@ def short(algo: str, folder: Path, batches: int, resume: bool = False, device: s
     settings = training_preset("wiring_post", algo, **TINY | {"episodes": 2 * batches, "device": device})
     trainer, played = prepare_training(task, settings)
     found = train(trainer, played, settings, folder=folder, resume=resume)
-    return found, train_json(task, settings, found)
+    return found, train_json(train_result(task, settings, found))
 
 
 def test_a_run_goes_on_where_it_was_trained_and_nowhere_else(monkeypatch, tmp_path: Path):

@@ -167,6 +167,8 @@ def train_hybrid(
     other = sorted(set(stages) - set(STAGES))
     if other:
         raise InputError(f"stages: there is no {', '.join(other)}; expected some of {', '.join(STAGES)}.")
+    if not stages:
+        raise InputError(f"stages: none is left; expected some of {', '.join(STAGES)}.")
     plan, told = plan or plan_of(task.name), callback or (lambda *_: None)
     experts = candidate_experts(task, list(trajectories))
     spending = Spending(settings.episodes, settings.minutes)
@@ -181,10 +183,13 @@ def train_hybrid(
         chosen = _robust(run, experts, expert)
         _note(folder, notes)
         policy = _clone(run, chosen)
+        # Of the first stage alone comes a path, and no policy.
+        if "clone" in stages or (folder / "clone.pt").is_file():
+            _finish(policy, folder, notes)
         _note(folder, notes)
         if "tune" in stages:
             policy = _tune(run, policy)
-    _finish(policy, folder, notes)
+            _finish(policy, folder, notes)
     return policy, notes
 
 
@@ -255,7 +260,7 @@ def _searches(run: _Run, given: Path | None) -> bool:
     """Return whether the first stage makes an expert, instead of taking one that is there, or none."""
     if given is not None and given.is_file():
         return False
-    if run.resume and (run.folder / "expert.json").is_file():
+    if (run.resume or "robust" not in run.stages) and (run.folder / "expert.json").is_file():
         return False
     cloned = "clone" not in run.stages and (run.folder / "clone.pt").is_file()
     return "robust" in run.stages or not cloned
@@ -266,7 +271,11 @@ def _robust(run: _Run, experts: list[Expert], given: Path | None) -> Expert | No
     if not _searches(run, given):
         file = given or folder / "expert.json"
         run.spending.add(run.notes.get("robust", {}))
-        return load_expert(file, task) if given is not None or (run.resume and file.is_file()) else None
+        if given is None and not file.is_file():
+            return None
+        if not run.resume:
+            run.told("robust", 1, 1, f"the path is taken from {file}")
+        return load_expert(file, task)
     began = run.spending.mark()
     generations = plan.generations if "robust" in run.stages else 0
     coarse = with_fidelity(task, task.coarse)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from typing import Any
 
@@ -51,6 +52,7 @@ class Ppo:
     def __init__(self, policy: Policy, settings: TrainingSettings, *, fixed: bool = False) -> None:
         """Make critic and optimisers for a policy; `fixed` leaves its normaliser as it is."""
         self.policy, self.settings, self.fixed = policy, settings, fixed
+        self.played: dict[str, Tensor] | None = None
         self.critic = Critic(policy, settings)
         value = ValueOperator(self.critic, in_keys=["features"])
         self.loss = ClipPPOLoss(
@@ -75,6 +77,7 @@ class Ppo:
 
     def iterate(self, episodes: Episodes) -> tuple[Batch, dict[str, float]]:
         """Play and learn; return what was played and how learning went."""
+        self.played = copy.deepcopy(self.policy.state_dict())
         batch = played_batch(self.policy, episodes)
         if not bool(self.policy.normaliser.count > 0):
             self.policy.normaliser.update(batch.features)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -99,7 +100,7 @@ def train_result(task: Task, settings: TrainingSettings, found: Trained) -> dict
         "episodes": found.episodes,
         "seconds": round(found.seconds, 1),
         "cpu_seconds": round(found.cpu_seconds, 1),
-        "best_batch": {"success": found.best[0], "return": found.best[1]} if found.rows else None,
+        "best_batch": {"success": found.best[0], "return": found.best[1]} if math.isfinite(found.best[1]) else None,
         "interrupted": found.interrupted,
         "settings": asdict(settings),
         "torch": torch.__version__,
@@ -108,9 +109,9 @@ def train_result(task: Task, settings: TrainingSettings, found: Trained) -> dict
     }
 
 
-def train_json(task: Task, settings: TrainingSettings, found: Trained) -> str:
+def train_json(result: dict[str, Any]) -> str:
     """Return what training came to as JSON."""
-    return json.dumps(train_result(task, settings, found), indent=1) + "\n"
+    return json.dumps(result, indent=1) + "\n"
 
 
 def device_name(device: torch.device) -> str:

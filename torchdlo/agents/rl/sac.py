@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import torch
@@ -27,6 +28,7 @@ class Sac:
     def __init__(self, policy: Policy, settings: TrainingSettings) -> None:
         """Make critics, target networks, temperature and buffer for a policy."""
         self.policy, self.settings, self.done = policy, settings, 0
+        self.played: dict[str, Tensor] | None = None
         critic = ValueOperator(Critic(policy, settings, actions=policy.spec.actions), in_keys=["features", "action"])
         self.loss = SACLoss(
             torchrl_actor(policy), critic, num_qvalue_nets=2, target_entropy=-0.5 * policy.spec.actions, alpha_init=0.1
@@ -83,6 +85,7 @@ class Sac:
     def iterate(self, episodes: Episodes) -> tuple[Batch, dict[str, float]]:
         """Play and learn; return what was played and how learning went."""
         s, policy = self.settings, self.policy
+        self.played = copy.deepcopy(policy.state_dict()) if self.done >= s.warm else None
         if isinstance(episodes, RayEpisodes):
             return self._learn_from(episodes.collect(policy, uniform=self.done < s.warm))
         seen = episodes.reset()

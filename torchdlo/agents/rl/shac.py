@@ -8,6 +8,7 @@ those of others, are cut with respect to each action, before scenes are averaged
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -127,6 +128,7 @@ class Shac:
     def __init__(self, policy: Policy, settings: TrainingSettings) -> None:
         """Make critics and optimisers for a policy."""
         self.policy, self.settings = policy, settings
+        self.played: dict[str, Tensor] | None = None
         self.critic = nn.ModuleList(Critic(policy, settings) for _ in range(self.critics))
         self.target = nn.ModuleList(Critic(policy, settings) for _ in range(self.critics))
         self.target.load_state_dict(self.critic.state_dict())
@@ -197,6 +199,7 @@ class Shac:
         told: list[dict[str, Tensor]] = []
         if not bool(self.policy.normaliser.count > 0):
             _look_first(self.policy, episodes, seen)
+        self.played = copy.deepcopy(self.policy.state_dict())
         self.lost.clear()
         while done < episodes.horizon:
             window, seen = self.play(episodes, seen, done, failed)

@@ -36,6 +36,9 @@ class Trainer(Protocol):
     """An algorithm."""
 
     policy: Policy
+    played: dict[str, torch.Tensor] | None
+    """Numbers of the policy that began to play the last batch, with the normaliser that it saw through; None if random
+    actions played it."""
 
     def iterate(self, episodes: Episodes) -> tuple[Batch, dict[str, float]]:
         """Play one batch of episodes and learn."""
@@ -51,7 +54,7 @@ class Trained:
     policy: Policy
     """The best one by what its batch earned, success first."""
     best: tuple[float, float]
-    """Share of successes and mean return of that batch."""
+    """Share of successes and mean return of that batch; negative infinity if no policy has played one."""
     episodes: int = 0
     seconds: float = 0.0
     cpu_seconds: float = 0.0
@@ -96,6 +99,9 @@ def train(
             _loop(trainer, episodes, settings, done, folder, callback or (lambda *_: None), stage, notes or {})
         except KeyboardInterrupt:
             done.interrupted = True
+        if not math.isfinite(done.best[1]):
+            # No policy has played a batch yet: the present one is as good as any.
+            done.policy.load_state_dict(trainer.policy.state_dict())
         if folder is not None:
             _write(trainer, episodes, settings, done, folder, notes or {})
     return done
@@ -128,8 +134,6 @@ def _loop(
     last = time.monotonic()
     while done.episodes + episodes.count <= settings.episodes and done.seconds < 60 * settings.minutes:
         began, busy = time.monotonic(), time.process_time()
-        # What is judged is the policy that played, not the one that has learned from it.
-        acting = copy.deepcopy(trainer.policy.state_dict())
         batch, told = trainer.iterate(episodes)
         done.episodes += episodes.count
         done.seconds += time.monotonic() - began
@@ -137,9 +141,11 @@ def _loop(
         row = _row(done, episodes, batch) | told
         done.rows.append(row)
         mark = (row["success"], row["return"])
-        if mark > done.best:
+        # What is judged is the policy that played, not the one that has learned from it. Of algorithms that learn while
+        # they play, it is the one that began.
+        if trainer.played is not None and mark > done.best:
             done.best = mark
-            done.policy.load_state_dict(acting)
+            done.policy.load_state_dict(trainer.played)
         if writer is not None:
             for name, value in row.items():
                 writer.add_scalar(f"{stage}/{name}", value, done.episodes)

@@ -20,7 +20,7 @@ def training_html(result: Mapping[str, Any]) -> str:
     """Return the page of a run without stages, from the content of its result.json."""
     rows, best = result["curve"], result["best_batch"]
     title = f"{words(result['task'])} by {result['algorithm'].upper()}"
-    said = "Nothing was learned: no batch was played."
+    said = "No policy has played a batch."
     if best:
         said = f"The best batch succeeds in {percent(best['success'])} of its episodes and earns {best['return']:.4g}."
     parts = [
