@@ -239,7 +239,7 @@ def test_the_first_stage_alone_makes_no_policy_and_its_path_is_kept_where_it_is_
     assert any("the path is taken from" in said for said in told)
 
 
-def test_ctrl_c_in_the_last_stage_leaves_the_clone_as_the_policy(tmp_path: Path):
+def test_ctrl_c_in_the_last_stage_leaves_the_clone_as_the_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def stop(stage: str, *_) -> None:
         if stage == "tune":
             raise KeyboardInterrupt
@@ -248,6 +248,14 @@ def test_ctrl_c_in_the_last_stage_leaves_the_clone_as_the_policy(tmp_path: Path)
         train_hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path / "run", plan=PLAN, callback=stop)
     clone, policy = (load_policy(tmp_path / "run" / name) for name in ("clone.pt", "policy.pt"))
     assert all(torch.equal(a, b) for a, b in zip(clone.parameters(), policy.parameters(), strict=True))
+    # A tuned one stays where going on with it is stopped.
+    run = {"folder": tmp_path / "run", "plan": PLAN, "resume": True}
+    train_hybrid(Lead(), [found(tmp_path)], settings(), **run)
+    (tmp_path / "run" / "policy.pt").write_bytes(b"tuned")
+    monkeypatch.setattr(stages, "_tune", lambda *_: stop("tune"))
+    with pytest.raises(KeyboardInterrupt):
+        train_hybrid(Lead(), [found(tmp_path)], settings(), **run)
+    assert (tmp_path / "run" / "policy.pt").read_bytes() == b"tuned"
 
 
 class Vain(Lead):

@@ -183,10 +183,11 @@ def train_hybrid(
         chosen = _robust(run, experts, expert)
         _note(folder, notes)
         policy = _clone(run, chosen)
-        # Of the first stage alone comes a path, and no policy.
-        if "clone" in stages or (folder / "clone.pt").is_file():
-            _finish(policy, folder, notes)
         _note(folder, notes)
+        # Of the first stage alone comes a path, and no policy; one that was tuned before stays until it is tuned on.
+        cloned = "clone" in stages or (folder / "clone.pt").is_file()
+        if cloned and not ("tune" in stages and "tune" in notes):
+            _finish(policy, folder, notes)
         if "tune" in stages:
             policy = _tune(run, policy)
             _finish(policy, folder, notes)
