@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,15 @@ from lead import Lead
 from torchdlo import envs
 from torchdlo.agents import deployment
 from torchdlo.agents.data.demonstrators import make_demonstrator
-from torchdlo.agents.deployment import JointMotion, arms_of, motion_text, play_motion, replay_joints, time_scale
+from torchdlo.agents.deployment import (
+    JointMotion,
+    _sampled,
+    arms_of,
+    motion_text,
+    play_motion,
+    replay_joints,
+    time_scale,
+)
 from torchdlo.agents.policies import Policy, PolicySpec, save_policy, task_features
 from torchdlo.cli import app
 from torchdlo.cli.policies import _perturb
@@ -218,8 +227,22 @@ def test_limits_of_joints_that_mimic_others_hold(path):
 
 def test_the_simulator_plays_what_was_written(path):
     motion = time_scale(Lead(), arms_of(Lead()), path, same=True)
-    assert replay_joints(Lead(), arms_of(Lead()), motion.position, HERE)
-    assert not replay_joints(Lead(), arms_of(Lead()), motion.position[:1].expand(7, -1), HERE)
+    assert replay_joints(Lead(), arms_of(Lead()), motion, HERE)
+    still = replace(motion, position=motion.position[:1].expand(7, -1), velocity=torch.zeros_like(motion.velocity))
+    assert not replay_joints(Lead(), arms_of(Lead()), still, HERE)
+
+
+def test_the_simulator_keeps_to_the_times_of_the_file(path):
+    step = 1e-3 * Lead().frame_skip
+    fast, slow = (time_scale(Lead(), arms_of(Lead()), path, same=True, acceleration=a) for a in (1e4, 0.05))
+    assert fast.slower == 1.0 and slow.slower > 2.0
+    assert torch.allclose(_sampled(fast, step), fast.position, atol=1e-12)
+    played = _sampled(slow, step)
+    assert len(played) == 1 + math.ceil(float(slow.time[-1]) / step - 1e-6)
+    assert torch.equal(played[-1], slow.position[-1])
+    # What controllers make of the points keeps within the limits, and so does what is played.
+    assert float((played.diff(dim=0, n=2) / step**2)[:-1].abs().max()) < 0.0501
+    assert replay_joints(Lead(), arms_of(Lead()), slow, HERE)
 
 
 def test_files_say_the_same():

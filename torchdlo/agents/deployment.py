@@ -278,9 +278,28 @@ def motion_text(motion: JointMotion, kind: str, notes: dict[str, Any]) -> str:
     return json.dumps({"header": header, "joint_names": list(motion.names), "points": points}, indent=1) + "\n"
 
 
+def _sampled(motion: JointMotion, step: float) -> Tensor:
+    """Return where joints are at the begin of every control step and at the end, on cubics between points, (K, J)."""
+    time, last = motion.time, motion.time[-1]
+    count = int(torch.ceil(last / step - 1e-6))
+    at = (step * torch.arange(count + 1, dtype=time.dtype)).clamp(max=last)
+    k = (torch.searchsorted(time, at, right=True) - 1).clamp(0, len(time) - 2)
+    width = (time[k + 1] - time[k])[:, None]
+    u = (at - time[k])[:, None] / width
+    before, after = motion.position[k], motion.position[k + 1]
+    bend = width * (motion.velocity[k] * (1 - u) - motion.velocity[k + 1] * u) + (after - before) * (2 * u - 1)
+    return before + u * (after - before) + u * (1 - u) * bend
+
+
 @torch.no_grad()
-def replay_joints(task: Task, robots: list[Robot], position: Tensor, moved: Tensor) -> bool:
-    """Play joint positions (P, J) in the simulator; return whether the task is done."""
+def replay_joints(task: Task, robots: list[Robot], motion: JointMotion, moved: Tensor) -> bool:
+    """Play a motion in the simulator, at its own times; return whether the task is done.
+
+    Tasks whose hands open and close on the way say when by actions, not by times: they are played as fast as they were
+    simulated.
+    """
+    timed = len(task.schedule.stages) < 2
+    position = _sampled(motion, 1e-3 * task.frame_skip) if timed else motion.position
     parts = position.split([len(robot.arm) for robot in robots], -1)
     tools = []
     for robot, part in zip(robots, parts, strict=True):
@@ -290,8 +309,8 @@ def replay_joints(task: Task, robots: list[Robot], position: Tensor, moved: Tens
     path = torch.stack(tools, 1)
     made = episode.prepare_at(task, moved, execution=episode.quick_execution(task))
     world = made.start
-    for k in range(task.horizon):
-        way = path[k + 1].to(moved) - world.target.pos[0]
+    for place in path[1:]:
+        way = place.to(moved) - world.target.pos[0]
         action = torch.cat([way.flatten(), torch.zeros_like(way.flatten())])[None]
         world = episode.act(made, world, action)
     world = episode.finish(made, world)

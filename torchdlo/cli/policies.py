@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -118,7 +119,7 @@ def train(
 
     torchdlo evaluate runs/train/wiring_post-hybrid
     """
-    from torchdlo.agents.rl.settings import training_preset
+    from torchdlo.agents.rl.settings import check_belonging, training_preset
     from torchdlo.envs import find, short_name
 
     quiet_torchrl()
@@ -131,7 +132,9 @@ def train(
     if workers is not None and address is None:
         raise InputError("--workers: it says how many processes of a Ray cluster play; give --address, too.")
     given["collectors"] = None if address is None else workers or 2
-    chosen = training_preset(task, algo, variation=variation, **given, **_read(settings or []))
+    more = _read(settings or [])
+    chosen = training_preset(task, algo, variation=variation, **given, **more)
+    check_belonging(algo, more)
     made, how = find(task), execution_choice(execution)
     if algo != "hybrid" and (trajectory or without):
         raise InputError(f"--trajectory and --without: they belong to hybrid, not to {algo}; leave them out.")
@@ -221,24 +224,25 @@ def _hybrid(
     other = sorted(set(without) - set(STAGES))
     if other:
         raise InputError(f"--without {', '.join(other)}: expected some of {', '.join(STAGES)}.")
+    spent = None
     if not trajectories and not (resume and (out / "expert.json").exists()):
-        trajectories = [_searched(task, settings.seed, out)]
+        file, spent = _searched(task, settings, out)
+        trajectories = [file]
     stages = [name for name in STAGES if name not in without]
-    plan = plan_of(task.name)
+    choices: dict[str, Any] = {"plan": plan_of(task.name), "stages": stages, "resume": resume, "searched": spent}
     try:
         with progress() as show, deferred_interrupt(show) as callback:
-            _, notes = train_hybrid(
-                task, trajectories, settings, folder=out, plan=plan, stages=stages, resume=resume, callback=callback
-            )
+            _, notes = train_hybrid(task, trajectories, settings, folder=out, callback=callback, **choices)
     except KeyboardInterrupt:
         raise stopped(f"what is done is kept in {out}", resume=True) from None
-    for name in STAGES:
+    shown = ("search", *STAGES)
+    for name in shown:
         if name in notes:
             spent = f"{notes[name]['episodes']} episodes, {notes[name]['cpu_seconds']:.0f} CPU s"
             ended = notes[name].get("ended")
             spent += f"; the budget of {ended} ended it" if ended else ""
             typer.echo(f"{name + ':':8}{spent}", err=as_json)
-    write_atomically(out / "report.html", hybrid_html(notes, STAGES))
+    write_atomically(out / "report.html", hybrid_html(notes, shown))
     if set(stages) != {"robust"} or (out / "clone.pt").is_file():
         typer.echo(f"policy: {out / 'policy.pt'}", err=as_json)
     typer.echo(f"page:   {out / 'report.html'}", err=as_json)
@@ -246,8 +250,8 @@ def _hybrid(
         typer.echo(json.dumps(notes, indent=1))
 
 
-def _searched(task: Task, seed: int, out: Path) -> Path:
-    """Return the file of a trajectory that is searched now, or was before with the same seed."""
+def _searched(task: Task, settings: TrainingSettings, out: Path) -> tuple[Path, dict[str, Any]]:
+    """Return the file of a trajectory that is searched now, or was before with the same seed, and what that used."""
     from torchdlo.agents.trajopt.presets import search_preset
     from torchdlo.agents.trajopt.search import optimize
     from torchdlo.agents.trajopt.search_result import result_json, trajectory_json
@@ -255,26 +259,37 @@ def _searched(task: Task, seed: int, out: Path) -> Path:
 
     file = out / "search" / "trajectory.json"
     result = file.with_name("result.json")
-    if file.exists() and result.exists() and _seed_of(result) == seed:
-        typer.echo(f"search: {file} is taken, which was searched before with this seed", err=True)
-        return file
-    problem, chosen = TaskProblem(task), search_preset(task.name, "hybrid", seed=seed, episodes=1200)
-    journal = out / "search" / "journal"
+    if file.exists() and result.exists():
+        known = read_entry(result, "a result of a search")
+        if known["settings"]["seed"].whole() == settings.seed:
+            typer.echo(f"search: {file} is taken, which was searched before with this seed", err=True)
+            seconds = known["seconds"].number(low=0)  # files do not say those of the CPU
+            return file, _search_notes(known["episodes"].whole(), seconds, seconds)
+    problem, chosen = TaskProblem(task), search_preset(task.name, "hybrid", seed=settings.seed, episodes=1200)
+    journal, late = out / "search" / "journal", list[str]()
+    until, busy = time.monotonic() + 60 * settings.minutes, time.process_time()
     with progress() as show, deferred_interrupt(show) as callback:
-        found = optimize(problem, chosen, journal=journal, resume=journal.exists(), callback=callback)
-    if found.interrupted:
+
+        def told(*message: Any) -> None:
+            callback(*message)
+            if time.monotonic() > until:
+                late.append(f" within {settings.minutes:g} minutes")
+                raise KeyboardInterrupt
+
+        found = optimize(problem, chosen, journal=journal, resume=journal.exists(), callback=told)
+    if found.interrupted and not late:
         raise stopped(f"what was searched is kept in {out / 'search'}", resume=True)
     if not bool(found.outcome.success[0]):
-        raise InputError(
-            f"{task.name}: the search found no trajectory that succeeds; give one with --trajectory, or another --seed."
-        )
+        said = f"the search found no trajectory that succeeds{''.join(late)}"
+        raise InputError(f"{task.name}: {said}; give one with --trajectory, another --seed or more --minutes.")
     write_atomically(file, trajectory_json(found, problem))
     write_atomically(result, result_json(found, problem, chosen))
-    return file
+    return file, _search_notes(found.episodes, found.seconds, time.process_time() - busy)
 
 
-def _seed_of(result: Path) -> int:
-    return read_entry(result, "a result of a search")["settings"]["seed"].whole()
+def _search_notes(episodes: int, seconds: float, busy: float) -> dict[str, Any]:
+    """Return what a search used as stages of the hybrid say it."""
+    return {"episodes": episodes, "seconds": round(seconds, 1), "cpu_seconds": round(busy, 1), "log": []}
 
 
 def evaluate(
@@ -492,7 +507,8 @@ def _perturb(
         folder = (path if path.is_dir() else path.parent).resolve()
         if (folder / "expert.json").exists():
             actors[f"expert of {folder.name}"] = robustness.following(load_expert(folder / "expert.json", task))
-        actors[f"policy {folder.name}"] = robustness.policy_acting(policy)
+        name = f"policy {folder.name}" + ("" if path.is_dir() or path.name == "policy.pt" else f"/{path.name}")
+        actors[name] = robustness.policy_acting(policy)
     with progress() as show, deferred_interrupt(show) as callback:
         results = robustness.perturbed(actors, task, starts=starts, seed=seed, callback=callback)
     content = json.dumps({"generator": "torchdlo evaluate", "files": [str(p) for p in policies]} | results, indent=1)

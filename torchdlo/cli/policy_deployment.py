@@ -119,7 +119,7 @@ def deploy(
     acceleration: Annotated[float, typer.Option(help="Greatest acceleration of a joint in rad/s^2.")] = 10.0,
     own: OwnTaskOption = None,
     rope_model: RopeModelOption = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Play the file in the simulator.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Play the file in the simulator, at its times.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print what it came to as JSON.")] = False,
 ) -> None:
     """Write joint positions and velocities for real arms.
@@ -157,7 +157,7 @@ def deploy(
     said |= {"seconds": float(motion.time[-1]), "points": len(motion.time), "reset_seed": reset_seed}
     write_atomically(out, deployment.motion_text(motion, kind, said))
     if dry_run:
-        said["dry_run_success"] = deployment.replay_joints(task, robots, motion.position, moved)
+        said["dry_run_success"] = deployment.replay_joints(task, robots, motion, moved)
     what_for = "policy" if isinstance(what, Policy) else "trajectory"
     how = "success" if good else "no success"
     typer.echo(

@@ -113,6 +113,15 @@ def test_densities_are_those_of_torchs_distributions(squash: bool, state_sigma: 
     torch.testing.assert_close(density, wanted.log_prob(action).sum(-1), rtol=1e-8, atol=1e-8)
 
 
+def test_weights_that_are_not_finite_are_refused(tmp_path: Path):
+    policy = made()
+    with torch.no_grad():
+        policy.net[0].weight[0, 0] = math.nan
+    save_policy(policy, tmp_path / "policy.pt")
+    with pytest.raises(InputError, match=r"policy.pt: its weights are not finite: training went astray"):
+        load_policy(tmp_path / "policy.pt")
+
+
 def test_a_policy_comes_back_from_its_file(tmp_path: Path):
     policy = made(task="coiling")
     policy.normaliser.update(torch.randn(10, policy.spec.features.width))

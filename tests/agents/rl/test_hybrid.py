@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -195,6 +196,35 @@ def test_ctrl_c_ends_the_search_of_a_trajectory(tmp_path: Path, monkeypatch: pyt
     assert not (tmp_path / "x" / "search" / "trajectory.json").exists()
 
 
+@pytest.mark.parametrize("won", [True, False])
+def test_a_search_keeps_to_the_budget_of_the_clock_and_counts(won: bool, tmp_path: Path, monkeypatch, capsys):
+    from torchdlo.agents.trajopt import search, search_result
+
+    monkeypatch.setitem(envs.TASKS, "lead", Lead)
+
+    def late(*_, callback, **__):
+        with pytest.raises(KeyboardInterrupt):
+            time.sleep(0.02)
+            callback("search", 100, 1200, "")
+        outcome = SimpleNamespace(success=torch.tensor([won]))
+        return SimpleNamespace(interrupted=True, outcome=outcome, episodes=100, seconds=7.0)
+
+    monkeypatch.setattr(search, "optimize", late)
+    monkeypatch.setattr(search_result, "result_json", lambda *_: "{}")
+    monkeypatch.setattr(search_result, "trajectory_json", lambda *_: found(tmp_path).read_text())
+    monkeypatch.setattr(stages, "plan_of", lambda _: PLAN)
+    with pytest.raises(SystemExit) as done:
+        app.main(["train", "lead", "--out", str(tmp_path / "x"), "--minutes", "1e-4", "--count", "8", "--json"])
+    told = capsys.readouterr()
+    if won:
+        notes = json.loads(told.out)
+        assert (notes["search"]["episodes"], notes["search"]["seconds"]) == (100, 7.0)
+        assert notes["robust"]["ended"] == "minutes" and len(notes["clone"]["log"]) == 1
+        assert "<td>search</td>" in (tmp_path / "x" / "report.html").read_text()
+    else:
+        assert done.value.code == 2 and "no trajectory that succeeds within 0.0001 minutes" in told.err
+
+
 def test_an_earlier_search_is_taken_if_its_seed_was_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
     from torchdlo.agents.trajopt import search
 
@@ -211,7 +241,7 @@ def test_an_earlier_search_is_taken_if_its_seed_was_the_same(tmp_path: Path, mon
     folder = tmp_path / "search"
     folder.mkdir()
     (folder / "trajectory.json").write_text("{}")
-    (folder / "result.json").write_text(json.dumps({"settings": {"seed": 3}}))
+    (folder / "result.json").write_text(json.dumps({"settings": {"seed": 3}, "episodes": 9, "seconds": 2.5}))
     for seed, code in ((3, (0, None)), (4, (130,))):
         with pytest.raises(SystemExit) as done:
             app.main(["train", "lead", "--out", str(tmp_path), "--seed", str(seed)])
@@ -429,6 +459,9 @@ def test_commands_train_and_judge(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         (["train", "lead", "--algo", "ppo", "--set", "speed=1"], "there is no speed"),
         (["train", "lead", "--algo", "trpo"], "algorithm is 'trpo'"),
         (["train", "lead", "--without", "search"], "--without search"),
+        (["train", "lead", "--algo", "ppo", "--set", "window=3"], "window: it is a setting of shac, sapo"),
+        (["train", "lead", "--algo", "sac", "--set", "warm=0"], "warm is 0; expected at least 1 batch"),
+        (["train", "coiling", "--trajectory", str(found(tmp_path))], "it is a trajectory of lead with 6 actions"),
         (["evaluate", str(out), "--protocol", "blind"], "--protocol blind"),
     ):
         with pytest.raises(SystemExit) as done:

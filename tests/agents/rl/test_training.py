@@ -72,6 +72,25 @@ def test_a_run_that_was_resumed_ends_as_if_never_stopped(name: str, tmp_path: Pa
     assert bits(run(name, 5, tmp_path, resume=True)) == bits(run(name, 5))
 
 
+@pytest.mark.parametrize("name", KINDS)
+def test_weights_that_go_astray_end_a_run_and_do_not_replace_what_is_kept(name: str, tmp_path: Path, monkeypatch):
+    run(name, 2, tmp_path)
+    kept = (tmp_path / "checkpoint.pt").read_bytes()
+    plain = KINDS[name].iterate
+
+    def astray(self, episodes):
+        found = plain(self, episodes)
+        with torch.no_grad():
+            next(iter(self.policy.parameters())).fill_(math.nan)
+        return found
+
+    monkeypatch.setattr(KINDS[name], "iterate", astray)
+    with pytest.raises(InputError, match=r"rate is .*: weights of the policy are no longer finite after 24 episodes"):
+        run(name, 9, tmp_path, resume=True, interval=0.0)
+    assert (tmp_path / "checkpoint.pt").read_bytes() == kept
+    assert all(bool(x.isfinite().all()) for x in load_policy(tmp_path).state_dict().values())
+
+
 def test_training_leaves_torchs_generator_as_it_was():
     torch.manual_seed(1)
     before = torch.get_rng_state()

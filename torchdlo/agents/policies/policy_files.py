@@ -54,6 +54,9 @@ def load_policy(path: Path | str, notes: bool = False) -> Any:
             check_shapes(made(), content["state"], str(path), what)
         policy = made()
         policy.load_state_dict(content["state"])
+        if not all(bool(value.isfinite().all()) for value in policy.state_dict().values()):
+            said = "its weights are not finite: training went astray; train it anew, in smaller steps"
+            raise InputError(f"{path}: {said}.")
         said = content["notes"]
     except InputError:
         raise

@@ -120,8 +120,12 @@ def candidate_experts(task: Task, trajectories: list[Path]) -> list[Expert]:
     for file in trajectories:
         content = read_trajectory(file)
         path = torch.tensor(content["tool"].numbers(None, None, 3, most=1e6), dtype=torch.float32)
-        good = content["success"].flag() and content["task"].value == task.name and path.shape == shape[:3]
-        if good:
+        if content["task"].value != task.name or path.shape != shape[:3]:
+            raise InputError(
+                f"{file}: it is a trajectory of {one_line(content['task'].value)} with {len(path)} actions; expected "
+                f"one of {task.name}, with {task.horizon}."
+            )
+        if content["success"].flag():
             check_scene(file)
             found.append(Expert(path, still, f"{file.parent.name}, same places"))
             found.append(Expert(path, along, f"{file.parent.name}, moved along"))

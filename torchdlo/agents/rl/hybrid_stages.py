@@ -63,7 +63,8 @@ class Hybrid:
     count: int = 128
     """Episodes of a round."""
     search_noise: float = 0.0015
-    """Deviation of what is added to actions while a robust path is searched [m]."""
+    """Deviation of what is added to actions while a robust path is searched, and the most with which the last stage
+    begins [m]."""
     search_sigma: float = 0.004
     """First deviation of the places of that search [m]."""
     noise: float = 0.001
@@ -83,9 +84,12 @@ class Hybrid:
     annealed from nothing in the first one."""
 
 
+_COILING = {"search_noise": 5e-4, "search_sigma": 1e-3, "noise": 3e-4}
+"""The hand goes round the cone at less than a millimetre from its surface: noise of 1 mm makes it touch."""
 _PLANS: dict[str, dict[str, float]] = {
-    # The hand goes round the cone at less than a millimetre from its surface: noise of 1 mm makes it touch.
-    "coiling": {"search_noise": 5e-4, "search_sigma": 1e-3, "noise": 3e-4},
+    "coiling": _COILING,
+    "coiling_left": _COILING,
+    "coiling_right": _COILING,
     # Its matter makes an episode cost several times what one of the surrogate does, in which the path is searched.
     "gathering": {"starts": 8, "count": 64, "rounds": 1, "validation": 16, "tune_episodes": 0},
     # Fingers hold the band by friction: it slips out where its halves pull unevenly, by 0.7 mm of way.
@@ -148,6 +152,7 @@ def train_hybrid(
     plan: Hybrid | None = None,
     stages: Sequence[str] = STAGES,
     expert: Path | None = None,
+    searched: dict[str, Any] | None = None,
     resume: bool = False,
     callback: Callback | None = None,
 ) -> tuple[Policy, dict[str, Any]]:
@@ -161,6 +166,7 @@ def train_hybrid(
         plan: sizes of the stages.
         stages: which of `STAGES` to run; those left out are skipped, or taken from the files of an earlier run.
         expert: a file of an earlier first stage to begin with.
+        searched: what the search of the trajectories has used, as notes of a stage; its time counts.
         resume: go on from what is there.
         callback: told (stage, done, all, message).
     """
@@ -174,6 +180,9 @@ def train_hybrid(
     spending = Spending(settings.episodes, settings.minutes)
     run = _Run(task, settings, plan, folder, stages, resume, told, spending, _notes(folder) if resume else {})
     notes = _belonging(run, experts if trajectories else None, expert)
+    if searched is not None:
+        notes["search"] = searched
+    spending.add_time(notes.get("search", {}))
     _check_budget(run, experts, expert)
     if not resume:
         _begin_afresh(run, experts, expert)
@@ -434,7 +443,8 @@ def _tune(run: _Run, policy: Policy) -> Policy:
         mark = judge.mark(policy)
         log = [{"episodes": 0, "success": mark[0], "return": mark[1], "best": mark}]
         with torch.no_grad():
-            policy.log_sigma.fill_(math.log(settings.sigma))
+            # A policy that always fails under the noise learns from nothing.
+            policy.log_sigma.fill_(math.log(min(settings.sigma, plan.search_noise / fine.max_translation)))
         keeper.keep(log)
     if log:
         episodes.scale = 10.0 / max(1e-6, abs(log[0]["return"]))

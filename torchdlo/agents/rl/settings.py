@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +18,7 @@ __all__ = [
     "PUBLISHED",
     "TrainingSettings",
     "changed",
+    "check_belonging",
     "training_preset",
 ]
 
@@ -196,7 +197,7 @@ EXPECTED: dict[str, _Check] = {
     "entropy": _NOT_NEGATIVE,
     "replay": _whole(1),
     "updates": _whole(1),
-    "warm": _whole(0),
+    "warm": _whole(1, "at least 1 batch, from which features are normalised"),
     "polyak": _number("a number from 0 on, below 1", lambda x: 0 <= x < 1),
     "window": _whole(1, "at least 1 action, a whole number"),
     "critic_passes": _whole(1),
@@ -217,6 +218,27 @@ EXPECTED: dict[str, _Check] = {
 }
 """What each setting may be, in words and as a check."""
 
+
+_PPO = ("ppo", "hybrid")
+_GRADIENTS = ("shac", "sapo")
+_BELONGS: dict[str, tuple[str, ...]] = {
+    "batch": (*_PPO, "sac"),
+    "passes": _PPO,
+    "clip": _PPO,
+    "entropy": _PPO,
+    "lmbda": (*_PPO, *_GRADIENTS),
+    "replay": ("sac",),
+    "updates": ("sac",),
+    "warm": ("sac",),
+    "polyak": ("sac", *_GRADIENTS),
+    "window": _GRADIENTS,
+    "critic_passes": _GRADIENTS,
+    "parts": _GRADIENTS,
+    "tame": _GRADIENTS,
+    "entropy_rate": ("sapo",),
+    "temperature": ("sapo",),
+}
+"""Settings that some algorithms alone have; the hybrid's last stage is PPO."""
 
 _ALGORITHM: dict[str, dict[str, Any]] = {
     "ppo": {},
@@ -246,6 +268,14 @@ def _as_written(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _as_written(part) for name, part in value.items()}
     return [_as_written(part) for part in value] if isinstance(value, list | tuple) else value
+
+
+def check_belonging(algorithm: str, given: Iterable[str]) -> None:
+    """Refuse names of settings that an algorithm would pass over."""
+    for name in given:
+        if algorithm not in _BELONGS.get(name, (algorithm,)):
+            said = f"it is a setting of {', '.join(_BELONGS[name])}, and {algorithm} has none; leave it out"
+            raise InputError(f"{name}: {said}.")
 
 
 def training_preset(task: str, algorithm: str, **given: Any) -> TrainingSettings:

@@ -99,11 +99,21 @@ def train(
             _loop(trainer, episodes, settings, done, folder, callback or (lambda *_: None), stage, notes or {})
         except KeyboardInterrupt:
             done.interrupted = True
-        if not math.isfinite(done.best[1]):
+        astray = not _finite(trainer.policy)
+        if not math.isfinite(done.best[1]) and not astray:
             # No policy has played a batch yet: the present one is as good as any.
             done.policy.load_state_dict(trainer.policy.state_dict())
         if folder is not None:
-            _write(trainer, episodes, settings, done, folder, notes or {})
+            if astray:
+                _write_best(done, folder, notes or {})
+            else:
+                _write(trainer, episodes, settings, done, folder, notes or {})
+    if astray:
+        kept = "" if folder is None else f" {folder / 'policy.pt'} holds the best one until then."
+        raise InputError(
+            f"rate is {settings.rate:g}: weights of the policy are no longer finite after {done.episodes} episodes; "
+            f"take smaller steps.{kept}"
+        )
     return done
 
 
@@ -118,6 +128,10 @@ def usable_device(settings: TrainingSettings) -> torch.device:
 def gpus(device: torch.device) -> list[torch.device]:
     """Return the devices beside the CPU whose random numbers a run uses."""
     return [device] if device.type == "cuda" else []
+
+
+def _finite(policy: Policy) -> bool:
+    return all(bool(x.isfinite().all()) for x in policy.state_dict().values())
 
 
 def _loop(
@@ -149,6 +163,8 @@ def _loop(
         if writer is not None:
             for name, value in row.items():
                 writer.add_scalar(f"{stage}/{name}", value, done.episodes)
+        if not _finite(trainer.policy):
+            break
         if folder is not None and time.monotonic() - last > settings.interval:
             _write(trainer, episodes, settings, done, folder, notes)
             last = time.monotonic()
@@ -212,6 +228,10 @@ def _write(
     }
     # Files of a GPU's run are read where there is none.
     save_checkpoint(folder / _CHECKPOINT, pytree.tree_map_only(torch.Tensor, torch.Tensor.cpu, content))
+    _write_best(done, folder, notes)
+
+
+def _write_best(done: Trained, folder: Path, notes: dict[str, Any]) -> None:
     write_atomically(folder / "log.csv", log_csv(done.rows))
     save_policy(
         done.policy, folder / "policy.pt", notes | {"episodes": done.episodes, "seconds": round(done.seconds, 1)}

@@ -49,7 +49,7 @@ def hybrid_html(notes: Mapping[str, Any], stages: Sequence[str]) -> str:
         stages: names of all stages, in their order.
     """
     run = [name for name in stages if name in notes]
-    last = notes[run[-1]]["log"] if run else []
+    last = [row for row in notes[run[-1]]["log"] if "success" in row] if run else []
     said = "No stage was run."
     if last:
         share = last[-1].get("best", last[-1]["success"])
@@ -64,7 +64,9 @@ def hybrid_html(notes: Mapping[str, Any], stages: Sequence[str]) -> str:
             [_stage(name, notes[name]) for name in run],
         ),
     ]
-    drawn = {name: notes[name]["log"] for name in run if notes[name]["log"]}
+    # A last entry may say which budget ended the stage.
+    logs = {name: [row for row in notes[name]["log"] if "success" in row] for name in run}
+    drawn = {name: log for name, log in logs.items() if log}
     if drawn:
         parts.append(_image(stages_png(drawn), "shares of successes of each stage"))
     parts += ["<h2>Plan</h2>", _settings(notes["plan"]), "<h2>Settings</h2>", _settings(notes["settings"])]
