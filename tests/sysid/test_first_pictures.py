@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,16 +35,16 @@ def raw_of(own: FilmedProblem) -> np.ndarray:
     return own.space.to_raw(np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))]))
 
 
-def pixels(own: FilmedProblem, motion: np.ndarray) -> np.ndarray:
-    """Return where the camera sees motions (T, M, 3) by pictures, (F, M, 2)."""
+def pixels(own: FilmedProblem, motion: np.ndarray, camera: Sequence[float] = (0.0,) * 8) -> np.ndarray:
+    """Return where the camera, which is off by so much, sees motions (T, M, 3) by pictures, (F, M, 2)."""
     sims = torch.as_tensor(motion[None, None]).float()
-    return seen_by(own.spines.views[0], sims, torch.zeros(1, 8), own.model.dt)[0][0, 0].numpy()
+    return seen_by(own.spines.views[0], sims, torch.tensor([camera]), own.model.dt)[0][0, 0].numpy()
 
 
-def shown(own: FilmedProblem, true: Start) -> np.ndarray:
+def shown(own: FilmedProblem, true: Start, camera: Sequence[float] = (0.0,) * 8) -> np.ndarray:
     """Let the camera see ropes that go on as they begin, and return where in its pictures they are, (F, M, 2)."""
     times = own.model.dt * np.arange(own.motion.markers.shape[1])
-    seen = pixels(own, true.pos[0] + true.vel[0] * times[:, None, None])
+    seen = pixels(own, true.pos[0] + true.vel[0] * times[:, None, None], camera)
     along = np.diff(seen, axis=1)
     parts = {
         "places": seen[None, :, :-1] + 0.5 * along,
@@ -72,6 +73,21 @@ def test_a_rope_that_hangs_elsewhere_is_found_where_its_first_pictures_show_it(
     look_at_first_pictures(own, raw_of(own))
     off, balance = (beside(pixels(own, pos)[0], seen[0]) for pos in (own.begin(own.offset[None]).pos, own.start.pos))
     assert balance > 25 and off < 2
+
+
+def test_cameras_are_found_by_the_grippers_between_which_ropes_are_drawn(swing: FilmedProblem) -> None:
+    """A camera that is turned by a degree sees the whole rope elsewhere, and a rope cannot be elsewhere at its ends."""
+    modes, off = np.zeros((1, 2, swing.shapes.shape[1], 3)), []
+    modes[0, 0, 0], modes[0, 1, 0] = [1.0, -1.0, 0.5], [0.5, 1.0, 0.0]
+    for cameras in (False, True):
+        own = replace(swing)
+        true = own.begin(modes.reshape(1, 1, -1))
+        shown(own, true, (0.017, -0.01, 0.012, 0.0, 0.0, 0.0, 0.0, 0.0))
+        raw = look_at_first_pictures(own, raw_of(own), cameras=cameras)
+        assert np.array_equal(raw, raw_of(own)) != cameras
+        aside = np.array(own.spines.views[0].camera.rotation)[:2] @ (own.begin(own.offset[None]).pos - true.pos)[0].T
+        off.append(float(np.abs(aside).max()))
+    assert off[1] < 0.02 and off[0] > 3 * off[1], off
 
 
 def test_what_was_shown_is_kept_where_ropes_of_another_stiffness_are_in_balance(swing: FilmedProblem) -> None:

@@ -184,12 +184,11 @@ def baseline(
     # Balances are cheap, and stiff ropes have shapes that do not depend on how stiff they are.
     starts = max(starts, FILMED_STARTS) if recording.still else starts
     first = np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))])
-    look_at_first_pictures(own, own.space.to_raw(first))
+    raw = look_at_first_pictures(own, own.space.to_raw(first), cameras=True)
     if given is not None:
-        raw = own.space.to_raw(first)
-        refine_start(own, first, search=True)
+        refine_start(own, own.space.to_values(raw), search=True)
     else:
-        raw = _scouted(own, starts, seed, report)
+        raw = _scouted(own, raw, starts, seed, report)
     best = _fitted(own, raw, iterations, report, near)
     first = np.concatenate([first[: len(own.free)], np.zeros(len(own.spines.nuisances.names))])
     if not np.isfinite(near):
@@ -206,17 +205,17 @@ def require_simulated(recording: Recording, best: Fit) -> None:
         )
 
 
-def _scouted(own: FilmedProblem, starts: int, seed: int, report: Callback) -> np.ndarray:
+def _scouted(own: FilmedProblem, raw: np.ndarray, starts: int, seed: int, report: Callback) -> np.ndarray:
     """Return coordinates (N,) in the basin of the best fit; of ropes at rest with the clamps that fit better.
 
     A rope that bends within clamps that hold it looks like a very stiff one at rest: a basin of its own.
     """
-    raw = scout(own, starts, np.random.default_rng(seed), report)
+    raw = scout(own, raw, starts, np.random.default_rng(seed), report)
     if not (own.trials[0].still and own.model.mesh.clamps and "clamp_fraction" in own.options):
         return raw
     other = own.with_options(clamp_fraction=1.0 - own.model.clamp_fraction)
     best = fit(own, raw, 6)
-    found = fit(other, scout(other, starts, np.random.default_rng(seed), report), 6)
+    found = fit(other, scout(other, raw, starts, np.random.default_rng(seed), report), 6)
     if found.cost < best.cost:
         own.take(other)
         best = found
@@ -357,7 +356,8 @@ def sharper(own: FilmedProblem, raw: np.ndarray, iterations: int) -> Fit:
     """Return the fit with half the steps, without wrong frames and with what finer simulations change."""
     # What steps damp is taken for damping.
     own.take(own.with_options(substep=own.model.dt / (2 * own.model.substeps)))
-    best = fit(own, raw, min(iterations, _LAST), near=True)
+    # Ropes that begin with a jerk need other starts then.
+    best = restart(own, fit(own, raw, min(iterations, _LAST), near=True), iterations)
     gate(own, own.space.to_values(best.raw))
     return corrected(own, best.raw, iterations)
 

@@ -39,7 +39,7 @@ START_WINDOW = 0.4
 _REACH = (np.log(40.0), np.log(4.0), np.log(10.0))
 """How far starts go either way of the guess."""
 
-_MOST = 5
+_MOST = 9
 """Most stiffnesses that a fit with starts in motion begins from."""
 
 _LOST = 1e-3
@@ -242,19 +242,20 @@ def _places(own: FilmedProblem, seconds: float | None) -> np.ndarray:
     return np.stack(out)
 
 
-def scout(own: FilmedProblem, starts: int, rng: np.random.Generator, report: Callback) -> np.ndarray:
+def scout(own: FilmedProblem, raw: np.ndarray, starts: int, rng: np.random.Generator, report: Callback) -> np.ndarray:
     """Return coordinates (N,) in the basin of the best fit, from many starts on the beginning of the trials.
 
-    There a cost has few local minima; the best go on over longer and longer times.
+    There a cost has few local minima; the best go on over longer and longer times. Of trials in motion, cameras begin
+    where coordinates (N,) have them.
     """
-    return _scout_moving(own, starts, report) if own.offset.shape[1] else _scout_resting(own, starts, rng, report)
+    return _scout_moving(own, raw, starts, report) if own.offset.shape[1] else _scout_resting(own, starts, rng, report)
 
 
-def _scout_moving(own: FilmedProblem, starts: int, report: Callback) -> np.ndarray:
+def _scout_moving(own: FilmedProblem, raw: np.ndarray, starts: int, report: Callback) -> np.ndarray:
     """Fit rope, cameras and starts of trials in motion together, from several stiffnesses."""
     lasts, stage = own.lasts, "trying starts"
     shares = (min(1.0, start_window(own) / lasts), 0.5, 0.7)
-    first = np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))])
+    first = np.concatenate([own.fixed[list(own.free)], own.space.to_values(raw)[len(own.free) :]])
     bend = own.free.index(own.model.parameters.index("bending_stiffness"))
     found: list[tuple[Fit, np.ndarray, Start]] = []
     factors = np.exp(_REACH[0] * np.linspace(-1, 1, int(np.clip(starts // 4, 3, _MOST))))

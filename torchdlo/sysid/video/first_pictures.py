@@ -12,6 +12,7 @@ from dataclasses import fields
 
 import numpy as np
 
+from torchdlo.sysid.video.filmed_fit import fit
 from torchdlo.sysid.video.filmed_problem import FilmedProblem
 from torchdlo.sysid.video.filmed_starts import fit_starts
 
@@ -41,22 +42,31 @@ class _Gliding(FilmedProblem):
         return pos + vel * (self.model.dt * np.arange(count))[:, None, None]
 
 
-def look_at_first_pictures(own: FilmedProblem, raw: np.ndarray) -> None:
+def look_at_first_pictures(own: FilmedProblem, raw: np.ndarray, *, cameras: bool = False) -> np.ndarray:
     """Let trials in motion begin as their first pictures show it, with cameras as numbers (N,) have them.
 
     Where that is is kept, see `FilmedProblem.shown`. Trials whose first picture was taken late begin as before.
+
+    Args:
+        own: the problem.
+        raw: coordinates of the numbers.
+        cameras: whether cameras may be elsewhere: a rope is drawn between its grippers, whose places are known.
+
+    Returns:
+        Coordinates of the numbers (N,), with cameras as first pictures show them.
     """
     if not own.offset.shape[1]:
-        return
+        return raw
     looked = ~own.start.at_rest & (np.min([view.first for view in own.spines.views], 0) <= _LATE)
     if looked.any():
         own.offset = own.offset.copy()
-        own.offset[looked] = _found(own.picked(np.flatnonzero(looked)), raw)
+        own.offset[looked], raw = _found(own.picked(np.flatnonzero(looked)), raw, cameras)
     own.shown = own.moved(own.offset[None])
+    return raw
 
 
-def _found(own: FilmedProblem, raw: np.ndarray) -> np.ndarray:
-    """Return offsets of the starts of trials that are all in motion, (B, J)."""
+def _found(own: FilmedProblem, raw: np.ndarray, cameras: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return offsets of the starts of trials that are all in motion, (B, J), and coordinates of the numbers (N,)."""
     firsts = np.array([view.first for view in own.spines.views])
     until = firsts.min(0) + _SPEEDS
     short = _Gliding(**{f.name: getattr(own, f.name) for f in fields(own)}).shortened(float(until.max()))
@@ -72,7 +82,9 @@ def _found(own: FilmedProblem, raw: np.ndarray) -> np.ndarray:
     few = _up_to(short, until)
     few.offset = offset[0]
     fit_starts(few, raw, 12)
-    return few.offset
+    if cameras:
+        raw = fit(few, raw, 12, near=True).raw
+    return few.offset, raw
 
 
 def _up_to(own: FilmedProblem, last: np.ndarray) -> FilmedProblem:
