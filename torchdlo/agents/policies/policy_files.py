@@ -16,7 +16,7 @@ from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
 from torchdlo.untrusted.tensor_file import check_shapes, read_tensors
 
-__all__ = ["load_policy", "policy_module", "save_policy"]
+__all__ = ["is_finite", "load_policy", "policy_module", "save_policy"]
 
 _GENERATOR = "torchdlo train"
 
@@ -54,7 +54,7 @@ def load_policy(path: Path | str, notes: bool = False) -> Any:
             check_shapes(made(), content["state"], str(path), what)
         policy = made()
         policy.load_state_dict(content["state"])
-        if not all(bool(value.isfinite().all()) for value in policy.state_dict().values()):
+        if not is_finite(policy):
             said = "its weights are not finite: training went astray; train it anew, in smaller steps"
             raise InputError(f"{path}: {said}.")
         said = content["notes"]
@@ -64,6 +64,11 @@ def load_policy(path: Path | str, notes: bool = False) -> Any:
         raise wrong from None
     policy.eval()
     return (policy, said) if notes else policy
+
+
+def is_finite(policy: torch.nn.Module) -> bool:
+    """Return whether all weights of a policy, and what it knows of features, are finite."""
+    return all(bool(value.isfinite().all()) for value in policy.state_dict().values())
 
 
 def policy_module(policy: Policy, *, scaled: bool = False) -> Any:

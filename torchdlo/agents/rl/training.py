@@ -19,6 +19,7 @@ import torch
 from torch.utils import _pytree as pytree
 
 from torchdlo.agents.policies import Policy, load_policy, save_policy
+from torchdlo.agents.policies.policy_files import is_finite
 from torchdlo.agents.rl.episodes import Episodes
 from torchdlo.agents.rl.rollout import Batch
 from torchdlo.agents.rl.settings import TrainingSettings, changed
@@ -99,7 +100,7 @@ def train(
             _loop(trainer, episodes, settings, done, folder, callback or (lambda *_: None), stage, notes or {})
         except KeyboardInterrupt:
             done.interrupted = True
-        astray = not _finite(trainer.policy)
+        astray = not is_finite(trainer.policy)
         if not math.isfinite(done.best[1]) and not astray:
             # No policy has played a batch yet: the present one is as good as any.
             done.policy.load_state_dict(trainer.policy.state_dict())
@@ -128,10 +129,6 @@ def usable_device(settings: TrainingSettings) -> torch.device:
 def gpus(device: torch.device) -> list[torch.device]:
     """Return the devices beside the CPU whose random numbers a run uses."""
     return [device] if device.type == "cuda" else []
-
-
-def _finite(policy: Policy) -> bool:
-    return all(bool(x.isfinite().all()) for x in policy.state_dict().values())
 
 
 def _loop(
@@ -163,7 +160,7 @@ def _loop(
         if writer is not None:
             for name, value in row.items():
                 writer.add_scalar(f"{stage}/{name}", value, done.episodes)
-        if not _finite(trainer.policy):
+        if not is_finite(trainer.policy):
             break
         if folder is not None and time.monotonic() - last > settings.interval:
             _write(trainer, episodes, settings, done, folder, notes)
