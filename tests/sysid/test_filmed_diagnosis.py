@@ -18,9 +18,12 @@ from torchdlo.sysid.diagnosis.error_floor import ErrorFloor
 from torchdlo.sysid.diagnosis.findings import findings_json, model_json, summary
 from torchdlo.sysid.recordings.recording import load_recording
 from torchdlo.sysid.video import filmed_diagnosis, filmed_fit
-from torchdlo.sysid.video.filmed_model import FilmedModel
-from torchdlo.sysid.video.filmed_problem import FilmedProblem
+from torchdlo.sysid.video.filmed_fit import Fit
+from torchdlo.sysid.video.filmed_model import FilmedModel, extended
+from torchdlo.sysid.video.filmed_problem import FilmedProblem, filmed_problem
 from torchdlo.sysid.video.filming import film_recording
+from torchdlo.sysid.video.fit_pool import FitPool
+from torchdlo.sysid.video.footage import views_of
 from torchdlo.vision.camera import looking_at
 from torchdlo.vision.film import FilmLook
 
@@ -70,6 +73,50 @@ def test_fits_leave_models_and_starts_as_they_are(monkeypatch: pytest.MonkeyPatc
     assert own.offset.size == test.offset.size == 0 and model.own is own and model.test is test
     alone = filmed_diagnosis._fitted_on(FilmedModel(own, model.fit, own), 3, None)
     assert alone.test is alone.own
+
+
+def test_effects_that_do_not_pay_beside_later_ones_are_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    def model(*effects: str) -> Any:
+        return SimpleNamespace(effects=effects, fit=SimpleNamespace(cost=1e-4 * (9 - len(effects))))
+
+    def less(base: Any, added: Any, sizes: Any, numbers: Any, raw: Any, dropped: Any) -> Any:
+        return model(*(e for e in base.effects if e not in dropped))
+
+    def refused(rival: Any, other: Any, *_: Any) -> str | None:
+        (gone,) = set(other.effects) - set(rival.effects)
+        return "closes 1% of the gap" if gone == "wind" or (gone, rival.effects) == ("drag", ("curvature",)) else None
+
+    monkeypatch.setattr(filmed_diagnosis, "extended", less)
+    monkeypatch.setattr(filmed_diagnosis, "_fitted_on", lambda model, *_: model)
+    monkeypatch.setattr(filmed_diagnosis, "_begun_alike", lambda rival, _: rival)
+    monkeypatch.setattr(filmed_diagnosis, "_refused", refused)
+    for found, left in (
+        (("wind", "curvature"), ("curvature",)),
+        (("curvature", "wind"), ("curvature", "wind")),
+        (("mass", "curvature"), ("mass", "curvature")),
+        # What pays beside another one only goes with it.
+        (("wind", "drag", "curvature"), ("curvature",)),
+    ):
+        floor = ErrorFloor(3e-4, 0.0, 0.0)
+        base, spare = filmed_diagnosis._needed(
+            model(*found), model(), list(found), floor, 3e-4, 3, lambda *_: None, FitPool(1)
+        )
+        assert base.effects == left and set(spare) == set(found) - set(left)
+
+
+def test_a_model_without_an_effect_keeps_its_other_numbers() -> None:
+    recording = load_recording(SAMPLE.with_name("sample_film"))
+    views, _ = views_of(recording, recording.train[:1])
+    own = filmed_problem(recording, recording.train[:1], views, options={"vertices": 13}).shortened(0.2)
+    raw = own.space.to_raw(np.concatenate([2 * own.fixed[list(own.free)], np.full(8, 1e-3)]))
+    plain = FilmedModel(own, Fit(raw, own.offset, np.zeros(1), np.zeros((1, 1, 1)), np.zeros((1, 0, 1, 1))), own)
+    drag, mass = {"air_drag.c_d": 1.5}, {"point_mass.position": 0.3, "point_mass.mass": 2e-3}
+    both = extended(extended(plain, ("air_drag",), drag, drag, None), ("point_mass",), mass, mass, None)
+    less = extended(both, (), {}, {}, None, ("air_drag",))
+    assert less.own.model.effects == ("point_mass",)
+    values = dict(zip(both.own.space.names, both.values, strict=True))
+    assert values.pop("air_drag.c_d") == pytest.approx(1.5)
+    assert dict(zip(less.own.space.names, less.values, strict=True)) == pytest.approx(values)
 
 
 def test_laws_that_say_as_much_of_unseen_films_are_not_told_apart() -> None:

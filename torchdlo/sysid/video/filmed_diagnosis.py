@@ -159,6 +159,9 @@ def _diagnosed(
         if not recording.still:
             first, base = further(films, first, base, given is None, report, pool)
             floor, level = _floor(base)
+        base, spare = _needed(base, first, list(shares), floor, level, plan.more, report, pool)
+        for name in spare:
+            del shares[name], ties[name]
     notes = [*notes, *said, *left_out(base, own), *chain_note(base)]
     view = _elsewhere(base, floor, level, without, report)
     shares = _rescaled(shares, first, base, floor)
@@ -311,6 +314,36 @@ def _round(
         for s in scores
     ]
     return best, candidates, rivals
+
+
+def _needed(
+    base: FilmedModel,
+    first: FilmedModel,
+    found: list[str],
+    floor: ErrorFloor,
+    level: float,
+    iterations: int,
+    report: Callback,
+    pool: FitPool,
+) -> tuple[FilmedModel, list[str]]:
+    """Return the model without effects that do not pay beside those that were found after them, and their names.
+
+    What was taken for one effect before another was known may have been the other's.
+    """
+    spare: list[str] = []
+    enough = _EXPLAINED * levenberg_marquardt.cost_of(level)
+    while len(found) - len(spare) > 1:
+        older = [name for name in found[:-1] if name not in spare]
+        less = pool.all(_fitted_on, [(extended(base, (), {}, {}, None, (n,)), iterations, enough) for n in older])
+        rivals = [_begun_alike(rival, base) for rival in less]
+        idle = [k for k, rival in enumerate(rivals) if _refused(rival, base, first, floor, level)]
+        if not idle:
+            break
+        k = min(idle, key=lambda k: rivals[k].fit.cost)
+        base = rivals[k]
+        spare.append(older[k])
+        report("looking back", 1, 1, f"{older[k]} does not pay beside what was found after it")
+    return base, spare
 
 
 def _alike(found: Mapping[str, tuple[float, float, float]], tie: float) -> list[str]:

@@ -96,8 +96,9 @@ def extended(
     sizes: dict[str, float],
     numbers: dict[str, float],
     raw: np.ndarray | None,
+    dropped: Sequence[str] = (),
 ) -> FilmedModel:
-    """Return a model with more effects, that begins with some of their numbers, not yet fitted.
+    """Return a model with other effects, that begins with some of their numbers, not yet fitted.
 
     Args:
         base: the model.
@@ -105,15 +106,17 @@ def extended(
         sizes: what counts as much of their numbers.
         numbers: those that are fitted.
         raw: coordinates (N,) of the model's own numbers; where they are if not given.
+        dropped: effects that it does without.
     """
-    effects = (*base.own.model.effects, *added)
+    effects = (*(e for e in base.own.model.effects if e not in dropped), *added)
     known = base.own.space.to_values(base.fit.raw if raw is None else base.own.space.clip(raw))
     count = len(base.own.free)
     parts = []
     for problem in (base.own,) if base.test is base.own else (base.own, base.test):
         more = problem.with_effects(effects, {k: v for k, v in sizes.items() if v}, list(numbers))
         for k, column in enumerate(problem.free):
-            more.fixed[more.model.parameters.index(problem.model.parameters[column])] = known[k]
+            if (name := problem.model.parameters[column]) in more.model.parameters:
+                more.fixed[more.model.parameters.index(name)] = known[k]
         for name, value in numbers.items():
             more.fixed[more.model.parameters.index(name)] = value
         parts.append(more)
