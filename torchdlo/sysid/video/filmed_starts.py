@@ -265,7 +265,7 @@ def _scout_moving(own: FilmedProblem, raw: np.ndarray, starts: int, report: Call
         values[bend : bend + 2] *= factor  # twisting stiffness follows
         begin_from_balance(own, own.full(values[None])[0])
         raw = own.space.clip(own.space.to_raw(values))
-        fit_starts(own, raw, 3, seconds=0.5 * start_window(own))
+        _begin_scouting(own, raw)
         found.append((fit(own, raw, 6, seconds=shares[0] * lasts, tolerance=2e-2), own.offset, own.start))
     for share, keep, passes in ((shares[1], 3, 6), (shares[2], 2, 8)):
         found = sorted(found, key=lambda each: total(each[0]))[:keep]
@@ -277,6 +277,19 @@ def _scout_moving(own: FilmedProblem, raw: np.ndarray, starts: int, report: Call
         report(stage, len(factors) + 2 - (share < shares[2]), len(factors) + 2, f"{1e3 * _least(found):.2f} mm")
     best, own.offset, own.start = min(found, key=lambda each: total(each[0]))
     return best.raw
+
+
+def _begin_scouting(own: FilmedProblem, raw: np.ndarray) -> None:
+    """Let trials begin as their first pictures say with numbers (N,), or elsewhere where that is far off.
+
+    A shape that first pictures fit may be one from which a stiff rope springs.
+    """
+    window = 0.5 * start_window(own)
+    lost = np.flatnonzero(~own.start.at_rest & ~(fit_starts(own, raw, 3, seconds=window) < _LOST))
+    if len(lost):
+        part = own.picked(lost)
+        search_starts(part, raw, 4, seconds=window)
+        own.offset[lost] = part.offset
 
 
 def _least(found: Sequence[tuple[Fit, np.ndarray, Start]]) -> float:
