@@ -117,6 +117,33 @@ def test_a_model_without_an_effect_keeps_its_other_numbers() -> None:
     values = dict(zip(both.own.space.names, both.values, strict=True))
     assert values.pop("air_drag.c_d") == pytest.approx(1.5)
     assert dict(zip(less.own.space.names, less.values, strict=True)) == pytest.approx(values)
+    windy = filmed_diagnosis._dosed(less, SimpleNamespace(name="wind", sizes={}), {"wind.c_d": 1.2}, None)  # type: ignore[arg-type]
+    calm = filmed_diagnosis._specialised(windy, "wind", "air_drag")
+    assert calm.own.model.effects == ("point_mass", "air_drag")
+    numbers = dict(zip(calm.own.space.names, calm.values, strict=True))
+    assert numbers == pytest.approx(values | {"air_drag.c_d": 1.2})
+
+
+def test_special_cases_of_laws_that_lead_are_fitted_from_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    def model(cost: float, name: str = "") -> Any:
+        return SimpleNamespace(fit=SimpleNamespace(cost=cost), name=name)
+
+    monkeypatch.setattr(filmed_diagnosis, "_specialised", lambda fitted, general, special: model(2e-4, special))
+    monkeypatch.setattr(filmed_diagnosis, "_fitted_on", lambda fitted, *_: fitted)
+    # What did not lead has a fit to the first seconds only, whose cost says nothing.
+    for leading, drag, kept in (
+        (["wind", "point_mass"], 1e-5, 2e-4),
+        (["wind", "air_drag"], 1e-4, 1e-4),
+        (["wind", "air_drag"], 3e-4, 2e-4),
+    ):
+        fits = {"wind": model(1.9e-4), "point_mass": model(9e-4), "air_drag": model(drag)}
+        led = filmed_diagnosis._with_special_cases(
+            fits, leading, ["wind", "air_drag", "point_mass"], 3, 1e-3, FitPool(1)
+        )
+        assert fits["air_drag"].fit.cost == kept
+        assert set(led) == {*leading, "air_drag"} and led == sorted(led, key=lambda n: fits[n].fit.cost)
+    fits = {"wind": model(1.9e-4)}
+    assert filmed_diagnosis._with_special_cases(fits, ["wind"], ["wind", "point_mass"], 3, 1e-3, FitPool(1)) == ["wind"]
 
 
 def test_laws_that_say_as_much_of_unseen_films_are_not_told_apart() -> None:

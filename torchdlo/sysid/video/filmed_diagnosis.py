@@ -283,7 +283,7 @@ def _round(
             continue
         fits[leading[k]] = found
         report(f"{stage}: fitting on", 1, 1, f"{leading[k]} {1e3 * found.fit.cost:.3f} mm")
-    led = sorted(leading, key=lambda n: fits[n].fit.cost)
+    led = _with_special_cases(fits, leading, names, more, enough, pool)
     rival, fits = _counted(rival, fits, led)
     for name in led:
         rival = _begun_alike(rival, fits[name])
@@ -314,6 +314,42 @@ def _round(
         for s in scores
     ]
     return best, candidates, rivals
+
+
+def _with_special_cases(
+    fits: dict[str, FilmedModel],
+    leading: Sequence[str],
+    names: Sequence[str],
+    iterations: int,
+    enough: float,
+    pool: FitPool,
+) -> list[str]:
+    """Add fits of the special cases of laws that lead, begun where those are; return what leads then, the best first.
+
+    Air drag is wind of no speed: a law with more numbers may find the way that the true one missed.
+    """
+    pairs = [(name, effect_library.special_case(name)[0]) for name in leading]
+    pairs = [(general, special) for general, special in pairs if special in names]
+    jobs = [(_specialised(fits[general], general, special), iterations, enough) for general, special in pairs]
+    led = list(leading)
+    for k, found in pool.map(_fitted_on, jobs) if jobs else ():
+        special = pairs[k][1]
+        # Others were fitted to the first seconds alone.
+        if special not in led or found.fit.cost < fits[special].fit.cost:
+            fits[special] = found
+        led += [special] * (special not in led)
+    return sorted(led, key=lambda n: fits[n].fit.cost)
+
+
+def _specialised(model: FilmedModel, general: str, special: str) -> FilmedModel:
+    """Return a model in which a special law takes the place of one that contains it, not yet fitted."""
+    known = dict(zip(model.own.space.names, model.values, strict=True))
+    numbers = {
+        n.name: float(known.get(general + n.name.removeprefix(special), n.param.scalar))
+        for n in effect_library.numbers(special, model.own.model.recording)
+    }
+    sizes = {name: abs(value) or 1.0 for name, value in numbers.items()}
+    return extended(model, (special,), sizes, numbers, None, (general,))
 
 
 def _needed(
