@@ -229,7 +229,7 @@ def _hybrid(
         file, spent = _searched(task, settings, out)
         trajectories = [file]
     stages = [name for name in STAGES if name not in without]
-    choices: dict[str, Any] = {"plan": plan_of(task.name), "stages": stages, "resume": resume, "searched": spent}
+    choices: dict[str, Any] = {"plan": plan_of(task.name), "stages": stages, "resume": resume, "search_notes": spent}
     try:
         with progress() as show, deferred_interrupt(show) as callback:
             _, notes = train_hybrid(task, trajectories, settings, folder=out, callback=callback, **choices)

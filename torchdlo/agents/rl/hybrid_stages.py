@@ -152,7 +152,7 @@ def train_hybrid(
     plan: Hybrid | None = None,
     stages: Sequence[str] = STAGES,
     expert: Path | None = None,
-    searched: dict[str, Any] | None = None,
+    search_notes: dict[str, Any] | None = None,
     resume: bool = False,
     callback: Callback | None = None,
 ) -> tuple[Policy, dict[str, Any]]:
@@ -166,7 +166,7 @@ def train_hybrid(
         plan: sizes of the stages.
         stages: which of `STAGES` to run; those left out are skipped, or taken from the files of an earlier run.
         expert: a file of an earlier first stage to begin with.
-        searched: what the search of the trajectories has used, as notes of a stage; its time counts.
+        search_notes: what the search of the trajectories has used, as notes of a stage; its time counts.
         resume: go on from what is there.
         callback: told (stage, done, all, message).
     """
@@ -180,8 +180,8 @@ def train_hybrid(
     spending = Spending(settings.episodes, settings.minutes)
     run = _Run(task, settings, plan, folder, stages, resume, told, spending, _notes(folder) if resume else {})
     notes = _belonging(run, experts if trajectories else None, expert)
-    if searched is not None:
-        notes["search"] = searched
+    if search_notes is not None:
+        notes["search"] = search_notes
     spending.add_time(notes.get("search", {}))
     _check_budget(run, experts, expert)
     if not resume:
