@@ -238,10 +238,10 @@ def _hybrid(
     shown = ("search", *STAGES)
     for name in shown:
         if name in notes:
-            spent = f"{notes[name]['episodes']} episodes, {notes[name]['cpu_seconds']:.0f} CPU s"
+            told = f"{notes[name]['episodes']} episodes, {notes[name]['cpu_seconds']:.0f} CPU s"
             ended = notes[name].get("ended")
-            spent += f"; the budget of {ended} ended it" if ended else ""
-            typer.echo(f"{name + ':':8}{spent}", err=as_json)
+            told += f"; the budget of {ended} ended it" if ended else ""
+            typer.echo(f"{name + ':':8}{told}", err=as_json)
     write_atomically(out / "report.html", hybrid_html(notes, shown))
     if set(stages) != {"robust"} or (out / "clone.pt").is_file():
         typer.echo(f"policy: {out / 'policy.pt'}", err=as_json)

@@ -328,8 +328,8 @@ def _with_special_cases(
 
     Air drag is wind of no speed: a law with more numbers may find the way that the true one missed.
     """
-    pairs = [(name, effect_library.special_case(name)[0]) for name in leading]
-    pairs = [(general, special) for general, special in pairs if special in names]
+    contained = ((name, effect_library.special_case(name)[0]) for name in leading)
+    pairs = [(general, special) for general, special in contained if special is not None and special in names]
     jobs = [(_specialised(fits[general], general, special), iterations, enough) for general, special in pairs]
     led = list(leading)
     for k, found in pool.map(_fitted_on, jobs) if jobs else ():
