@@ -280,12 +280,13 @@ def _scout_moving(own: FilmedProblem, raw: np.ndarray, starts: int, report: Call
 
 
 def _begin_scouting(own: FilmedProblem, raw: np.ndarray) -> None:
-    """Let trials begin as their first pictures say with numbers (N,), or elsewhere where that is far off.
+    """Let trials begin as their first pictures say with numbers (N,), or elsewhere where one is far off and others not.
 
-    A shape that first pictures fit may be one from which a stiff rope springs.
+    A shape that first pictures fit may be one from which a stiff rope springs. Where all are off, numbers are wrong.
     """
     window = 0.5 * start_window(own)
-    lost = np.flatnonzero(~own.start.at_rest & ~(fit_starts(own, raw, 3, seconds=window) < _LOST))
+    costs = fit_starts(own, raw, 3, seconds=window)
+    lost = np.flatnonzero(~own.start.at_rest & ~(costs < max(_LOST, _standing_out(costs))))
     if len(lost):
         part = own.picked(lost)
         search_starts(part, raw, 4, seconds=window)
