@@ -138,9 +138,7 @@ def refine_start(own: FilmedProblem, values: np.ndarray, passes: int = 8, *, sea
         costs = fit_starts(own, raw, passes, seconds=share * start_window(own))
     far = np.flatnonzero(~own.start.at_rest & ~(costs < _SLIGHT))
     if search and len(far):
-        part = own.picked(far)
-        search_starts(part, raw, passes, seconds=start_window(own))
-        own.offset[far] = part.offset
+        _begin_elsewhere(own, raw, far, passes, start_window(own))
 
 
 def restart(own: FilmedProblem, found: Fit, iterations: int, enough: float = _LOST) -> Fit:
@@ -223,6 +221,14 @@ def search_starts(own: FilmedProblem, raw: np.ndarray, passes: int = 8, *, secon
     return found[rows[0]]
 
 
+def _begin_elsewhere(own: FilmedProblem, raw: np.ndarray, rows: np.ndarray, passes: int, seconds: float) -> None:
+    """Let some trials begin where a search for other starts finds the best, see `search_starts`."""
+    part = own.picked(rows)
+    search_starts(part, raw, passes, seconds=seconds)
+    own.offset = own.offset.copy()
+    own.offset[rows] = part.offset
+
+
 def _places(own: FilmedProblem, seconds: float | None) -> np.ndarray:
     """Return starts (P, B, J): those of the problem, fresh ones, ropes in balance, and others nearer and farther.
 
@@ -288,9 +294,7 @@ def _begin_scouting(own: FilmedProblem, raw: np.ndarray) -> None:
     costs = fit_starts(own, raw, 3, seconds=window)
     lost = np.flatnonzero(~own.start.at_rest & ~(costs < max(_LOST, _standing_out(costs))))
     if len(lost):
-        part = own.picked(lost)
-        search_starts(part, raw, 4, seconds=window)
-        own.offset[lost] = part.offset
+        _begin_elsewhere(own, raw, lost, 4, window)
 
 
 def _least(found: Sequence[tuple[Fit, np.ndarray, Start]]) -> float:
